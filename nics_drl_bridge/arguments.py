@@ -1,4 +1,4 @@
-"""Checks of what callers pass to public functions: one sentence for each mistake.
+"""Checks of arguments of public functions, with one sentence for each mistake.
 
 Callers may write `robot=` or `model=`: both name the same argument.
 """
@@ -94,7 +94,7 @@ def check_path(what: str, value: Any) -> None:
         raise ConfigError(f"{what}={format_value(value)}: must be a name or a path.")
     if "\0" in str(value):
         raise ConfigError(
-            f"{what}={format_value(value)}: a path holds no null character."
+            f"{what}={format_value(value)}: a path can't contain a null character."
         )
 
 
@@ -138,7 +138,8 @@ def rename_robot_argument(
             f"{word}={format_value(value_by_word)} and {synonym}={format_value(value)}"
         )
         raise ConfigError(
-            f"{place}: {values} name two robots by two words for one thing; give one."
+            f"{place}: {values} name two robots, but the arguments are synonyms; give "
+            "one."
         )
     if positional is None:
         named[word] = value

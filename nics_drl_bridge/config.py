@@ -1,8 +1,8 @@
 """Strict configuration: YAML files checked against a schema.
 
 Errors name file, key and the nearest valid name. Unlike with PyYAML alone, `1e-3` is a number, and
-a duplicate key is an error. Aliases and merge keys are counted while reading, because a few lines
-can grow to gigabytes. Tags are refused, because they build objects.
+a duplicate key is an error. Aliases and merge keys are counted while reading, because a
+few lines can expand to gigabytes. Tags are refused, because they construct objects.
 """
 
 import re
@@ -27,7 +27,7 @@ from nics_drl_bridge.errors import (
 PACKAGE = "nics_drl_bridge"
 MAX_DEPTH = 32
 MAX_BYTES = 2**20  # maximum size of a YAML file
-# keys, values and lists; an alias counts as everything it stands for
+# keys, values and lists; an alias counts as its full content
 MAX_VALUES = 50_000
 _LONGEST_PROBLEM = 200
 
@@ -153,9 +153,9 @@ def _explain_error(
     if first["type"] in ("missing", "union_tag_not_found"):
         return f"the key {key!r} is missing; {missing_fix}."
     if first["type"] in _NO_KEYS:
-        return f"key {key!r}: must hold `key: value` pairs, not {_SHORT.repr(first['input'])}."
+        return f"key {key!r}: must contain `key: value` pairs, not {_SHORT.repr(first['input'])}."
     if first["type"] in _NO_LIST:
-        return f"key {key!r}: must be a list, as [a, b], not {_SHORT.repr(first['input'])}."
+        return f"key {key!r}: must be a list such as [a, b], not {_SHORT.repr(first['input'])}."
     if first["type"] in _COUNT:
         limits = first["ctx"]
         if "min_length" in limits:
@@ -213,7 +213,9 @@ def _find_inner_models(annotation: Any) -> list[type]:
 def check_no_device(path: Path) -> Path:
     """Returns the path. Raises ConfigError for a device or a pipe: reading it might never end."""
     if path.exists() and not (path.is_file() or path.is_dir()):
-        raise ConfigError(f"{path}: is a device or a pipe, not a file; copy it to one.")
+        raise ConfigError(
+            f"{path}: is a device or a pipe, not a file; copy its content to a file."
+        )
     return path
 
 
@@ -302,20 +304,18 @@ class _Loader(*_BASES):  # type: ignore[misc]
             )
         if self._values > MAX_VALUES:
             self._refuse(
-                event, f"it holds more than {MAX_VALUES} values, with all its aliases"
+                event, f"it contains more than {MAX_VALUES} values, including aliases"
             )
         if getattr(event, "tag", None) is not None:
             tag = reprlib.repr(event.tag.replace("tag:yaml.org,2002:", "!!"))
-            self._refuse(
-                event, f"the tag {tag} is not read here; write the value alone"
-            )
+            self._refuse(event, f"the tag {tag} is not supported; write only the value")
         if (
             is_alias
             and event.anchor in self.anchors
             and event.anchor not in self._sizes
         ):
             self._refuse(
-                event, f"the alias {reprlib.repr(event.anchor)} stands within itself"
+                event, f"the alias {reprlib.repr(event.anchor)} contains itself"
             )
         node = super().compose_node(parent, index)
         if event.anchor is not None:
@@ -332,7 +332,7 @@ class _Loader(*_BASES):  # type: ignore[misc]
                 self._refuse(key, "a key must be one word or number")
             if key.value in keys:
                 self._refuse(
-                    key, f"the key {reprlib.repr(key.value)} stands twice; keep one"
+                    key, f"the key {reprlib.repr(key.value)} occurs twice; keep one"
                 )
             keys.add(key.value)
         return dict(super().construct_mapping(node, deep=deep))
@@ -396,7 +396,7 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
         ) from None
     if data is None:
         raise ConfigError(
-            f"{source}: the file is empty; it must hold `key: value` lines."
+            f"{source}: the file is empty; it must contain `key: value` lines."
         )
     if not isinstance(data, dict):
         raise ConfigError(f"{source}: the top level must be `key: value` lines.")

@@ -25,7 +25,7 @@ class BridgeError(Exception):
         super().__init__(shorten(sentence, LONGEST))
 
     def reword(self, sentence: str) -> None:
-        """Sets another sentence; the fields of the error stay."""
+        """Sets another sentence and keeps the fields of the error."""
         self.args = (shorten(sentence, LONGEST),)
 
 
@@ -47,7 +47,7 @@ class MissingFileError(ConfigError):
 
 
 class UnknownNameError(ConfigError):
-    """A name is none of the files in `config/KIND`."""
+    """A name does not match any file in `config/KIND`."""
 
     def __init__(self, sentence: str = "", kind: str = "") -> None:
         self.kind = kind
@@ -57,7 +57,7 @@ class UnknownNameError(ConfigError):
 class RecordingError(BridgeError):
     """A recording can't be read or contains unusable data.
 
-    `reason` is the part of the sentence that says what is wrong, for errors that others quote.
+    `reason` is the part of the sentence that names the fault, for errors that quote it.
     """
 
     def __init__(self, sentence: str = "", reason: str = "") -> None:
@@ -74,7 +74,7 @@ class FitError(BridgeError):
 
 
 class BackendError(BridgeError):
-    """A backend (simulator, ROS 2 graph, vehicle) does not answer as it should."""
+    """A backend (simulator, ROS 2 graph, vehicle) does not respond correctly."""
 
 
 class PolicyError(BridgeError):

@@ -2,8 +2,9 @@
 
 Extensions are loaded in two ways. `load` looks a name up among installed entry points and classes
 that were imported explicitly, so the name may come from a data file. `import_class` and
-`load_module` take `path/to/file.py:ClassName` and run that file. They are only for what a user
-typed on the command line or passed to a Python function, never for what a file says.
+`load_module` take `path/to/file.py:ClassName` and run that file. They are only for
+names that a user typed on the command line or passed to a Python function, never for
+names from a file.
 """
 
 import hashlib
@@ -99,7 +100,7 @@ def import_class(group: str, place: str, base: type) -> type:
         needed = f"{base.__module__.removeprefix(f'{PACKAGE}.')}.{base.__name__}"
         raise ConfigError(f"{kind} kind {place!r}: is not a subclass of {needed}.")
     if name in find_extensions(group):
-        fix = "is installed under this name already; rename the class"
+        fix = "is already installed under this name; rename the class"
         raise ConfigError(f"{kind} {place!r}: another {kind} {fix}.")
     _imported.setdefault(group, {})[name] = loaded
     return loaded
@@ -107,7 +108,7 @@ def import_class(group: str, place: str, base: type) -> type:
 
 @contextmanager
 def require_modules(user: str) -> Iterator[None]:
-    """Turns the import error of a missing module into a ConfigError that says how to install it."""
+    """Converts the import error of a missing module to a ConfigError with the install command."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -117,7 +118,7 @@ def require_modules(user: str) -> Iterator[None]:
 
 
 def explain_missing(module: str) -> str:
-    """Returns a clause about a missing library, to follow the name of what needs it."""
+    """Returns a clause about a missing library, to be appended to the name of its user."""
     library = module.partition(".")[0]
     if library.endswith(ROS):
         fix = INSTALL_ROS
@@ -206,7 +207,9 @@ def explain_own_fault(error: BaseException) -> str | None:
         if hasattr(task, "step_into") and not module.startswith(f"{PACKAGE}."):
             place = f"{frame.f_code.co_filename}:{line}, in {frame.f_code.co_name}"
             return str(
-                ConfigError(f"task {task.__name__}: {place}: {error!r}; mend it.")
+                ConfigError(
+                    f"task {task.__name__}: {place}: {error!r}; correct the task."
+                )
             )
     return None
 
@@ -257,4 +260,4 @@ def _explain_unfit(path: Path, kind: str, error: Exception) -> str:
     line = error.lineno if isinstance(error, SyntaxError) else (lines or [None])[-1]
     place = f"{path}, line {line}" if line else str(path)
     reason = " ".join(str(error).split())
-    return f"{kind} {place}: can't be imported ({type(error).__name__}: {reason}); mend the file."
+    return f"{kind} {place}: can't be imported ({type(error).__name__}: {reason}); correct it."

@@ -125,7 +125,8 @@ def lock_file(path: Path, file: BinaryIO) -> None:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise ConfigError(
-            f"{path}: another process writes it; wait for its end, or choose another place."
+            f"{path}: another process is writing it; wait for it to end, or choose "
+            "another place."
         ) from None
     except OSError:  # a file system without locks
         pass
@@ -184,7 +185,7 @@ def write_whole_file(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def _name_path_in_errors(path: Path) -> Iterator[None]:
-    """Makes system errors name the requested path instead of a temporary one."""
+    """Replaces a temporary path in system errors by the requested one."""
     try:
         yield
     except OSError as error:
@@ -206,9 +207,9 @@ def format_json(data: Any, indent: int | None = None) -> str:
 
 
 def check_folder(path: str | Path, marker: str, sign: str = "") -> Path:
-    """Resolves a path; creates nothing. Raises ConfigError unless a folder can be written there.
+    """Resolves a path without creating it. Raises ConfigError unless a folder can be written.
 
-    A folder that is there must be empty or contain the file `marker` with the text `sign`.
+    An existing folder must be empty or contain the file `marker` with the text `sign`.
     """
     path = Path(path).resolve()
     if path.exists() and not path.is_dir():
@@ -217,10 +218,10 @@ def check_folder(path: str | Path, marker: str, sign: str = "") -> Path:
         )
     if path.is_dir() and any(path.iterdir()) and not (path / marker).exists():
         fix = "give a new folder, or empty this one."
-        raise ConfigError(f"{path}: holds other files and no {marker!r}; {fix}")
+        raise ConfigError(f"{path}: contains other files but no {marker!r}; {fix}")
     file = path / marker
     if sign and file.is_file() and sign.encode() not in file.read_bytes():
-        reason = "is not what this command writes under that name"
+        reason = "was not written by this command"
         raise ConfigError(f"{file}: {reason}; give a new folder.")
     check_above(path)
     return path
@@ -363,7 +364,7 @@ def check_sealed(file: BinaryIO) -> None:
     file.seek(0)
     digest = _hash_next(file, size)
     if file.read() != _SEAL + digest.encode():
-        raise ValueError("its checksum is missing or does not fit the rest")
+        raise ValueError("its checksum is missing or does not match")
     file.seek(0)
 
 
@@ -431,7 +432,7 @@ def _format_line(folder: Path, name: str) -> bytes:
 
 def _open_file(path: Path) -> BinaryIO:
     """Opens a file of a model. Raises ModelError if it is missing, not a file, or too large."""
-    reason = "missing, or no file"
+    reason = "missing, or not a file"
     try:
         if path.is_file():
             reason = f"larger than {MOST_BYTES // 2**20} MB"

@@ -37,13 +37,13 @@ from nics_drl_bridge.robot.noise import Latency, Noise
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
 
-FORMATS = "nics_drl_bridge/simulator_model/"  # how those of all versions begin
+FORMATS = "nics_drl_bridge/simulator_model/"  # common prefix of all versions
 FORMAT = f"{FORMATS}4"
 MODEL_FILE = "model.yaml"
 TABLE_FOLDER = "lidar_table"
 REPORT_FILE = "report.txt"
 _OF_TABLE = (f"{TABLE_FOLDER}/{name}" for name in (files.SUMS, *TABLE_FILES))
-MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)  # besides the manifest
+MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)  # in addition to the manifest
 # Files that `nics generate` draws, including pictures that only earlier versions wrote.
 REPORT_PAGE = "report.html"
 PICTURES_FOLDER = "pictures"
@@ -107,7 +107,9 @@ class SimulatorModel:
         dt = self.kinematics.dt
         steps = period / dt
         if not 0.5 < steps < np.inf or abs(steps - round(steps)) > 1e-6:
-            reason = f"is no multiple of the model's step {dt} s; change one of them."
+            reason = (
+                f"is not a multiple of the model's step {dt} s; change one of them."
+            )
             raise ModelError(f"control_period {period} s {reason}")
 
     @property
@@ -185,12 +187,13 @@ def generate(
         recording: a recording, or several of one robot, which are fitted together.
         robot: a RobotSpec, a name, a YAML file, or a model of the robot; also called `model`.
         lidar: a LidarSpec, a name or a YAML file; by default the robot's own.
-        shapes: obstacles to bake, besides the robot's own footprint.
+        shapes: obstacles to bake, in addition to the robot's own footprint.
         order: order of the Taylor model; `auto` chooses the one that predicts best.
         alpha: pruning threshold of Eq. 2; `auto` finds the knee.
-        assume: True fills in from the textbook what the drive did not show, marked as assumed.
-        strict: True refuses a drive that did not excite each input on its own.
-        anyway: True accepts a model that predicts hardly better than a standing robot.
+        assume: True uses textbook terms, marked as assumed, where the drive shows
+            nothing.
+        strict: True refuses a drive that did not vary each input independently.
+        anyway: True accepts a model that predicts hardly better than a robot at rest.
         sensors: sensors besides the lidar.
     """
     _check_given(recording, shapes, sensors)
@@ -207,7 +210,7 @@ def generate(
     reason = explain_uselessness(identified)
     if reason and not anyway:
         raise FitError(reason)
-    # Its state may differ, if the fit fell back to the textbook model.
+    # Its state may differ if the fit fell back to the textbook model.
     robot = identified.drive.spec
     # With a slow lidar, the control period is the time between two scans.
     dt = identified.model.dt
@@ -361,7 +364,7 @@ def load_model(folder: str | Path) -> SimulatorModel:
             )
             raise ModelError(f"{folder}: no such folder; {fix}.")
         raise ModelError(
-            f"{folder}: holds no {MODEL_FILE}; make a model with `nics generate`."
+            f"{folder}: contains no {MODEL_FILE}; make a model with `nics generate`."
         )
     inode = folder.stat().st_ino
     data = parse_yaml(read_text(path), str(path))

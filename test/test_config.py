@@ -53,7 +53,7 @@ def refusal(text, schema=Cart):
 )
 def test_a_key_that_stands_twice_is_refused(text):
     with pytest.raises(
-        ConfigError, match=r"file.yaml, line \d: the key '[ac]' stands twice"
+        ConfigError, match=r"file.yaml, line \d: the key '[ac]' occurs twice"
     ):
         parse_yaml(text, "file.yaml")
 
@@ -225,8 +225,8 @@ HOSTILE = {
         merges(*size): f"more than {MAX_VALUES} values"
         for size in ((7, 9), (24, 2), (2, 60_000))
     },
-    "a: &a {<<: *a}": "the alias 'a' stands within itself",
-    "a: &a [1, *a]": "line 1: the alias 'a' stands within itself",
+    "a: &a {<<: *a}": "the alias 'a' contains itself",
+    "a: &a [1, *a]": "line 1: the alias 'a' contains itself",
     **{f"x: 1\na: {tag} {'[1]'}": "line 2: the tag" for tag in ("!!int", "!!set")},
     "x: 1\na: !!python/name:os.system 1": "line 2: the tag",
     "!!int abc: 1": "the tag",
@@ -236,7 +236,7 @@ HOSTILE = {
     "a: " + "9" * 10_000: "line 1: a number of",
     "a: " + "[" * 100_000: "nested more than 32 levels deep; flatten it",
     "a: " + "{b: " * 100_000: "nested more than 32 levels deep",
-    f"{'k' * 500}: 1\n{'k' * 500}: 2": "stands twice",
+    f"{'k' * 500}: 1\n{'k' * 500}: 2": "occurs twice",
     f"a: *{'n' * 5000}": "line 1",
 }
 

@@ -189,7 +189,7 @@ def test_a_goal_lies_where_it_was_given_wherever_odometry_began(
         )
 
     # In the map it is far away, which nobody has confirmed.
-    far = r"\(2.00 m, 0.50 m\) in map, 16.\d+ m from where it stands, farther than 5 m.*say --yes"
+    far = r"\(2.00 m, 0.50 m\) in map, 16.\d+ m from where it stands, farther than 5 m.*use --yes"
     with pytest.raises(ConfigError, match=far):
         drive((2.0, 0.5), goal_frame="map")
     witnessed = far_from_the_origin.path
@@ -215,7 +215,7 @@ def test_a_far_goal_is_refused_before_anything_is_waited_for_where_nobody_can_be
     assert done.returncode == 2
     sentence = done.stderr.splitlines()[-1]
     assert "it will drive to 20.00 m ahead" in sentence
-    assert "farther than 5 m: nobody can confirm that here; say --yes" in sentence
+    assert "farther than 5 m: nobody can confirm that here; use --yes" in sentence
 
 
 @pytest.mark.ros

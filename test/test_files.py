@@ -299,7 +299,7 @@ def test_where_folders_can_not_change_places_a_failure_leaves_the_old_one(
     ("name", "content", "reason"),
     [
         ("thesis.tex", "years of work", r"holds other files and no 'model\.yaml'"),
-        (MARKER, "name: mine", "is not what this command writes"),
+        (MARKER, "name: mine", "was not written by this command"),
     ],
 )
 def test_a_folder_of_somebody_else_is_never_replaced(tmp_path, name, content, reason):

@@ -280,7 +280,7 @@ def test_a_model_over_an_older_one_keeps_what_the_user_put_there_and_nothing_els
     ("change", "said"),
     [
         *(
-            ({"control_period": period}, "is no multiple of the model's step")
+            ({"control_period": period}, "is not a multiple of the model's step")
             for period in (0.015, 0.001, 0.1001, 1e308)
         ),
         ({"kinematics": "mecanum"}, "robot 'direct' needs"),

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from nics_drl_bridge.generator import SimulatorModel
 
 PAGE = "assurance.html"
-EXIT_FAILED = 1  # a claim failed, or did not without the gate
-MIN_CONTROLS = 4  # fewer may all pass by chance
+EXIT_FAILED = 1  # a claim failed, or a control without the gate did not
+MIN_CONTROLS = 4  # fewer controls may all pass by chance
 COMPUTED_WITH = ("numpy", "numba", "scipy", "onnxruntime")
 
 
@@ -55,7 +55,7 @@ def assure(
         ),
     ] = None,
     episodes: Annotated[
-        int, Option(min=1, help="How many, in process.")
+        int, Option(min=1, help="Number of episodes in process.")
     ] = defaults.ASSURANCE_EPISODES,
     seed: Annotated[
         int, Option(min=0, help="Seed of the first episode.")
@@ -70,19 +70,21 @@ def assure(
     faults: Annotated[
         int,
         Option(
-            min=0, help="How many are injected over DDS, in real time; needs ROS 2."
+            min=0, help="Number of faults injected over DDS, in real time; needs ROS 2."
         ),
     ] = defaults.ASSURANCE_FAULTS,
     control: Annotated[
         Literal["no_gate"] | None,
-        Option(help="Run everything without the gate, which must find failures."),
+        Option(
+            help="Run everything without the gate, as a control that must find failures."
+        ),
     ] = None,
     replay: Annotated[
         int | None,
-        Option(min=0, metavar="SEED", help="Only drive this episode of a run again."),
+        Option(min=0, metavar="SEED", help="Only repeat this episode of a run."),
     ] = None,
     out: Annotated[
-        Path, Option(help="Folder for all output; a run there goes on.")
+        Path, Option(help="Folder for all output; an existing run is continued.")
     ] = Path("runs/assure"),
     as_json: console.JsonOption = False,
 ) -> None:
@@ -212,7 +214,7 @@ def _drive(run: "Run", out: Path) -> dict[str, Any]:
 
 
 def _tell_left(what: str, advance: console.Tell) -> Callable[[int, int], None]:
-    """Returns a function that shows the progress with the time left, by the rate so far."""
+    """Returns a function that shows the progress and the remaining time."""
     begun: list[tuple[float, int]] = []
 
     def tell(done: int, total: int) -> None:
@@ -297,7 +299,7 @@ def _tell(order: "Protocol", results: dict[str, Any], out: Path) -> None:
 
 
 def _is_as_expected(order: "Protocol", results: dict[str, Any]) -> bool:
-    """True if all was injected, no claim failed, and without the gate each tested claim did."""
+    """True if all faults were injected, no claim failed, and each control failed."""
     from nics_drl_bridge.gate.assurance.protocol import CLAIMS, LIMITS
 
     if results["not_injected"]:
@@ -306,7 +308,7 @@ def _is_as_expected(order: "Protocol", results: dict[str, Any]) -> bool:
         return False
     enough = 1 if order.control else MIN_CONTROLS
     for claim, figures in results["control"].items():
-        # Without the gate, values alone may keep limits as wide as the robot's range.
+        # Without the gate, commands may still keep limits as wide as the robot's range.
         must_fail = claim != LIMITS or order.claims == CLAIMS
         if must_fail and figures["trials"] >= enough and not figures["failures"]:
             return False

@@ -23,10 +23,10 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.status import STATUS
 
 WIDEST = 10_000
-# time before the first progress line, and between lines [s]
+# time before the first progress line and between lines [s]
 PATIENCE_S = 2.0
 REPEATED_S = 10.0
-# what is being done, amount done, total (0: unknown)
+# description, amount done, total (0: unknown)
 Tell = Callable[[str, int, int], None]
 
 
@@ -129,8 +129,8 @@ TopicOption = Annotated[
     list[str] | None,
     Option(
         metavar="ROLE=TOPIC",
-        help="Topic of one role, as cmd_vel=/car/drive; may be given several "
-        "times. Roles: cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.",
+        help="Topic of one role, such as cmd_vel=/car/drive; repeatable. Roles: "
+        "cmd_vel, pose, odom, joint_states, imu; the topic none disables a role.",
     ),
 ]
 RolesOption = Annotated[
@@ -204,8 +204,8 @@ def check_options(command: Callable[..., Any]) -> Callable[..., Any]:
                 needed_names = needed_options.get(name, ())
                 if needed_names and not given_options.keys() & needed_names:
                     alternatives = " or ".join(map(_format_option, needed_names))
-                    fix = f"{alternatives}; add that, or leave it out."
-                    raise ConfigError(f"{_format_option(name)}: belongs to {fix}")
+                    fix = f"{alternatives}; add it, or remove this option."
+                    raise ConfigError(f"{_format_option(name)}: requires {fix}")
                 for conflicting in conflicting_options.get(name, ()):
                     if conflicting in given_options:
                         _refuse_both(_format_option(conflicting), _format_option(name))
@@ -223,8 +223,8 @@ def _check_finite(name: str, value: Any) -> None:
 
 
 def _refuse_both(refused: str, partner: str) -> NoReturn:
-    fix = f"leave out {refused}, or {partner}."
-    raise ConfigError(f"{refused} does not go with {partner}; {fix}")
+    fix = f"remove {refused} or {partner}."
+    raise ConfigError(f"{refused} can't be combined with {partner}; {fix}")
 
 
 def _format_option(name: str) -> str:
@@ -283,12 +283,12 @@ def tell_replaced(file: Path) -> None:
     """Warns the user if an existing file will be replaced."""
     if file.exists():
         typer.echo(
-            f"{file.parent}: the {file.name} that is there will be replaced", err=True
+            f"{file.parent}: the existing {file.name} will be replaced", err=True
         )
 
 
 def format_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Formats a table; without a terminal, cells are neither cut nor wrapped."""
+    """Formats a table; without a terminal, cells are not truncated or wrapped."""
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Column, Table

@@ -67,10 +67,11 @@ AS_IT_IS = "as it is"
 PERTURBED = "mild"
 LINES = 10  # number of progress reports of a training
 ARRIVE_S = 90.0  # time for the robot to arrive [s]; includes compiling
-# ramp times of the demo's gate [s]: from zero to the maximum command, to the maximum rate
+# ramp times of the demo's gate [s]: from zero to the maximum command and to the maximum
+# rate
 FULL_COMMAND_S = 0.3
 FULL_RATE_S = 0.05
-GOOD = 0.9  # success rate below which the verdict doubts a policy
+GOOD = 0.9  # success rate below which the verdict is doubtful
 DEMO_PANELS = 9  # maximum number of drawn episodes
 R = TypeVar("R")
 
@@ -198,7 +199,8 @@ def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
     world = load_world(plan.world)
     robot, recording = _record_or_read(plan, say)
     say(f"generating a simulator of the robot {robot.name!r} from {recording.source}")
-    # The demo must steer even if the drive did not; the report lists the assumptions.
+    # The demo must steer even if the drive did not show it; the report lists the
+    # assumptions.
     model, identified = generate(
         recording, robot, mount_lidar(robot), world.shapes, assume=True
     )
@@ -232,7 +234,8 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     )
     return Learned(
         policy,
-        f"No policy was trained because {missing!r} is not installed: {policy!r} drives.",
+        f"No policy was trained because {missing!r} is not installed; {policy!r} is "
+        "used.",
     )
 
 
@@ -356,7 +359,7 @@ def _deploy(
         "policy_node": {**model_parameter, "policy": policy, "goal": goal},
     }
     say(f"deploying {', '.join(nodes)} in real time")
-    # The policy stops where it believes the goal is, and its odometry drifts.
+    # The policy stops where it believes the goal is, but its odometry drifts.
     near = Navigation(model.robot, model.lidar).goal_radius + 0.1
     arrived, path = _watch_episode(
         nodes, plan.out / "logs" / "realtime", goal, near, say

@@ -15,8 +15,8 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 EXIT_FINDINGS = 1
 LOAD_NOTE = (
-    "CPU and memory of middleware, policy and gate, on one core. Latencies from the stamp of a "
-    "scan: median, 99th percentile. The gate sends motion every 20 ms."
+    "CPU and memory of middleware, policy and gate on one core. Latencies from the "
+    "stamp of a scan: median, 99th percentile. The gate sends motion every 20 ms."
 )
 
 
@@ -35,11 +35,14 @@ def doctor(
     ] = None,
     namespace: console.NamespaceOption = "",
     duration: Annotated[
-        float, Option(min=1.0, help="How long to listen to a robot [s].")
+        float, Option(min=1.0, help="Time to listen to a robot [s].")
     ] = defaults.LISTEN_S,
     imu: console.ImuOption = defaults.IMU_TOPIC,
     install: Annotated[
-        bool, Option("--install", help="Check this machine instead: what works here.")
+        bool,
+        Option(
+            "--install", help="Check this machine instead: which features work here."
+        ),
     ] = False,
     load: Annotated[
         bool,
@@ -66,7 +69,7 @@ def doctor(
         expected = derive_expected(open_model(model or DEFAULT_ROBOT))
     elif model is not None:
         raise ConfigError(
-            "--model and --policy: give one of them, what the robot must fit."
+            "--model and --policy: give only one, which the robot must fit."
         )
     else:
         contract = load_policy(policy).contract
@@ -79,7 +82,7 @@ def doctor(
         with console.show_progress(f"listening for {duration:g} s"):
             facts = listen(duration, namespace, imu=imu)
     findings = examine(facts, expected)
-    text = f"{facts.source}: all fits {policy or model or DEFAULT_ROBOT}."
+    text = f"{facts.source}: everything fits {policy or model or DEFAULT_ROBOT}."
     if findings:
         heads = ("", "check", "where", "what does not fit", "what to do")
         rows = [(f.severity, f.check, f.where, f.what, f.fix) for f in findings]
@@ -141,7 +144,7 @@ def _tell_load(name: str, policy: str | None, as_json: bool) -> None:
     ]
     text = f"{console.format_table(heads, rows)}\n\n{LOAD_NOTE}"
     if unlimited:
-        text += f" Half a core and less are only measured as root ({unlimited})."
+        text += f" Half a core and less can only be measured as root ({unlimited})."
     facts = [asdict(load) for load in loads]
     console.print_line(as_json, text, policy=policy, loads=facts, unlimited=unlimited)
 

@@ -46,7 +46,7 @@ DART = "dart_dds"
 VEHICLE = "vehicle"
 NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node", DART: "dart_node"}
 PLACES = (FAST, *NODES)
-BY_DEFAULT = (FAST, DDS, MUJOCO)  # what one lacks, later ones lack, too
+BY_DEFAULT = (FAST, DDS, MUJOCO)  # if one is unavailable, so are the later ones
 LABELS = {
     FAST: "in process",
     DDS: "over DDS",
@@ -231,9 +231,9 @@ def find_robot(policy: str, contract: Contract) -> str:
     if name in list_shipped("robots"):
         return name
     where = f"; its model was {place}, which is gone" if place else ""
-    fix = "say where its model is with --model"
+    fix = "give its model with --model"
     raise ConfigError(
-        f"{policy}: is of the robot {name!r}, which is not shipped{where}; {fix}."
+        f"{policy}: is for the robot {name!r}, which is not shipped{where}; {fix}."
     )
 
 
@@ -262,7 +262,7 @@ class EvaluationOrder:
     world: str = defaults.EVALUATION_WORLD  # name or YAML file
     episodes: int = defaults.EVALUATION_EPISODES
     seed: int = defaults.EVALUATION_SEED
-    # some of `PLACES`, the first of which is the reference; empty: the usual ones that work
+    # some of `PLACES`, the first being the reference; empty: the usual ones that work
     places: Sequence[str] = ()
     conditions: Conditions = NO_CONDITIONS
 
@@ -322,7 +322,7 @@ def limit_time(
     world: AnyWorld,
     say: Say,
 ) -> Conditions:
-    """Sets the time limit: the policies', or one for robot and world; says if it is short."""
+    """Sets the time limit (the policies', or one for robot and world); warns if it is short."""
     pace = find_pace(model, [world])
     limits = [
         contract.max_episode_steps
@@ -337,7 +337,7 @@ def limit_time(
 
 
 def select_places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]:
-    """Returns the places of an order, or the usual ones that work here; says why others don't."""
+    """Returns the places of an order, or the usual ones that work; reports why others don't."""
     places = list[str]()
     for place in order.places or BY_DEFAULT:
         try:
@@ -536,14 +536,14 @@ def drive_vehicle(
     start = options.get("start", defaults.VEHICLE_START)
     goals = GoalOrder(goal, goal_frame, start, localised, confirm_beyond_m)
     radius = model.robot.footprint_radius
-    if not goals.needs_pose:  # refuse far goals before anybody has to wait
+    if not goals.needs_pose:  # refuse far goals before the operator has to wait
         planned = [
             goals.episode(sample_scene(world, radius, seed)) for seed in order.seeds
         ]
         farthest = max(planned, key=lambda episode: episode.distance)
         farthest.confirm(confirm)
     limited = limit_time(order.conditions, contracts, model, world, say)
-    # A policy that does not fit must fail before anything moves.
+    # A policy that does not fit must be refused before anything moves.
     open_policy(policy, model, order.conditions.kind)
     _examine_vehicle(model, namespace, options.get("imu", defaults.IMU_TOPIC), say)
     backend_options = {
@@ -567,7 +567,7 @@ def drive_vehicle(
                 episode.confirm(confirm)
             last = "" if arm else f"; arm {GATE}"
             ask(f"episode {count} of {order.episodes}: {episode.sentence()}{last}")
-            if goals.needs_pose:  # the vehicle may have been moved meanwhile
+            if goals.needs_pose:  # the vehicle may have been moved in the meantime
                 confirmed = episode.distance
                 episode = goals.episode(scene, backend.present_pose())
                 if episode.distance > confirmed + NEAR_M:

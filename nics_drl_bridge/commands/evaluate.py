@@ -39,14 +39,14 @@ def evaluate(
         Option(
             "--in",
             help="fast, dds, mujoco_dds or dart_dds; repeatable; "
-            "by default the first three, as far as they work here.",
+            "by default those of the first three that work here.",
         ),
     ] = None,
     episodes: Annotated[
         int | None,
         Option(
             min=1,
-            help=f"How many; {defaults.EVALUATION_EPISODES}, or 1 on a vehicle.",
+            help=f"Number of episodes; {defaults.EVALUATION_EPISODES}, or 1 on a vehicle.",
         ),
     ] = None,
     seed: Annotated[
@@ -63,7 +63,7 @@ def evaluate(
     ahead: Annotated[
         float,
         Option(
-            help="For --shadow without --goal: goal: where the robot is this much later [s]."
+            help="For --shadow without --goal: use the robot's position this much later [s]."
         ),
     ] = defaults.SHADOW_AHEAD_S,
     backend: Annotated[
@@ -75,7 +75,7 @@ def evaluate(
     start: Annotated[
         Literal["wait", "present"],
         Option(
-            help="For --hardware: wait until it stands at the start, or start where it is."
+            help="For --hardware: wait until it is placed at the start, or start where it is."
         ),
     ] = defaults.VEHICLE_START,
     goal: Annotated[
@@ -89,8 +89,8 @@ def evaluate(
         Literal["robot", "map"] | None,
         Option(
             metavar="robot|map",
-            help="For --hardware: the goal is ahead and left of where the robot "
-            "starts, or in map; robot with --start present, else map.",
+            help="For --hardware: the goal is relative to the robot's start (ahead, "
+            "left), or in map; robot with --start present, else map.",
         ),
     ] = None,
     confirm_beyond: Annotated[
@@ -98,7 +98,7 @@ def evaluate(
         Option(
             min=0.0,
             metavar="METRES",
-            help="For --hardware: a goal that is farther away is confirmed.",
+            help="For --hardware: ask for confirmation of goals farther away [m].",
         ),
     ] = defaults.CONFIRMED_BEYOND_M,
     namespace: console.NamespaceOption = "",
@@ -199,7 +199,7 @@ def _parse_point(text: str | None) -> tuple[float, float] | None:
             return x, y
     except ValueError:
         pass
-    raise ConfigError(f"--goal {text!r}: must be X,Y in metres, as 2.5,-1.")
+    raise ConfigError(f"--goal {text!r}: must be X,Y in metres, such as 2.5,-1.")
 
 
 def _list_differences(policy: str, comparison: "Shadow") -> list[tuple[str, ...]]:

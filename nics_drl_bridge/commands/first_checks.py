@@ -15,7 +15,7 @@ GREATEST_TRAINING_SEED = 2**32 - 1
 
 
 def check_writable(path: Path) -> None:
-    """Raises ConfigError unless a file can be written at a path; leaves nothing there."""
+    """Raises ConfigError unless a file can be written at a path; leaves no file."""
     from nics_drl_bridge.files import check_above
 
     check_above(path)
@@ -53,7 +53,7 @@ def check_robot(name: str) -> None:
         raise ModelError(f"unknown robot {name!r}; {suggest(name, shipped)} ({fix}).")
     if not (folder / "model.yaml").is_file():
         raise ModelError(
-            f"{folder}: holds no model.yaml; make a model with `nics generate`."
+            f"{folder}: contains no model.yaml; make a model with `nics generate`."
         )
 
 
@@ -81,7 +81,7 @@ def check_training(
 
     check_seeds(seeds, GREATEST_TRAINING_SEED)
     if len(set(seeds)) < len(seeds):
-        raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
+        raise ConfigError(f"seeds {list(seeds)}: give one or more, without duplicates.")
     if out is not None:
         if out.exists() and not out.is_dir():
             raise ConfigError(

@@ -42,12 +42,12 @@ def install(
     prefix: Annotated[
         Path | None,
         Option(
-            help="Install there, with a setup.bash to be sourced; else into this environment."
+            help="Folder to install into, with a setup.bash to source; by default this environment."
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Builds messages that the wheels of ROS 2 lack."""
+    """Builds message packages that are missing from ROS 2's wheels."""
     from nics_drl_bridge.commands.message_build import (
         Generators,
         check_programs,
@@ -113,9 +113,7 @@ def check_prefix(prefix: Path) -> Path:
             f"{prefix}: {error.strerror}; choose another place."
         ) from None
     if not os.access(prefix, os.W_OK):
-        fix = (
-            "install this package into a virtual environment of yours, or say --prefix"
-        )
+        fix = "install this package into a virtual environment, or use --prefix"
         raise ConfigError(f"{prefix}: can't be written to; {fix}.")
     return prefix.resolve()
 

@@ -36,7 +36,9 @@ def record(
     duration: Annotated[
         float, Option(help="Duration of the drive [s].")
     ] = defaults.DRIVE_S,
-    speed: Annotated[float, Option(help="Share of the greatest speeds to use.")] = 1.0,
+    speed: Annotated[
+        float, Option(help="Fraction of the maximum speeds to use.")
+    ] = 1.0,
     seed: Annotated[int, Option(help="Seed of the pattern.")] = 0,
     namespace: console.NamespaceOption = "",
     remap: Annotated[
@@ -75,7 +77,7 @@ def record(
     } | ({} if stamped is None else {STAMPED: stamped})
     plan = check_drive(parameters)
     if not preview:
-        # This comes first because ROS 2 from wheels restarts Python.
+        # This comes first because ROS 2 from wheels restarts the Python process.
         with extensions.require_modules("nics record"):
             from nics_drl_bridge.nodes.own_process import forward_errors
             from nics_drl_bridge.nodes.record_node import record as drive
@@ -180,11 +182,11 @@ def inspect(
     from nics_drl_bridge.recording.survey import inspect_tables
 
     if mapping is not None and mapping.exists():
-        raise ConfigError(f"--map {mapping}: is there already; give another name.")
+        raise ConfigError(f"--map {mapping}: already exists; give another name.")
     with open_source(source) as opened, console.show_progress(f"reading {source}"):
         tables = inspect_tables(opened)
     why = explain_no_mapping(source)
-    is_own = is_recording(source)  # a mapping can't name its arrays
+    is_own = is_recording(source)  # mappings don't apply to its arrays
     draft = None if is_own else propose_mapping(tables)
     doubts = () if draft is None else draft.doubts
     written = None
@@ -304,16 +306,19 @@ def generate(
         ),
     ] = defaults.PRUNING,
     assume_textbook: Annotated[
-        bool, Option(help="Fill in from the textbook what the drive did not show.")
+        bool,
+        Option(
+            help="Complete the model from the textbook where the drive shows nothing."
+        ),
     ] = False,
     strict: Annotated[
-        bool, Option(help="Refuse if an input was not moved on its own.")
+        bool, Option(help="Fail if an input was not varied independently.")
     ] = False,
     anyway: Annotated[
         bool,
         Option(
             "--anyway",
-            help="Write the model even if its predictions of unseen data are useless.",
+            help="Write the model even if it predicts unseen data badly.",
         ),
     ] = False,
     pictures: Annotated[
@@ -334,7 +339,7 @@ def generate(
     check_place(out)
     threshold = parse_alpha(alpha)
     terms = parse_order(order)
-    if lidar is not None:  # a wrong name fails before the drive is read
+    if lidar is not None:  # fail on a wrong name before reading the drive
         load_lidar(lidar)
     sensors = tuple(load_sensor(file) for file in sensor or ())
     shapes = load_world(world).shapes
@@ -379,7 +384,7 @@ def generate(
 
 
 def names_of_sources(recordings: Sequence[Path]) -> list[str]:
-    """Returns the names of recordings in a report: the path of a single one, else short names."""
+    """Returns the names of recordings for a report: the path of one, or short names of several."""
     if len(recordings) == 1:
         return [str(recordings[0])]
     names = [path.name for path in recordings]

@@ -62,7 +62,7 @@ def up(
     extensions.require("nics up", "rclpy")
     nodes = launch.nodes(values)
     if not nodes:
-        raise ConfigError(f"nics up {what}: there is nothing to start; say rviz:=true.")
+        raise ConfigError(f"nics up {what}: there is nothing to start; add rviz:=true.")
     run(nodes)
 
 

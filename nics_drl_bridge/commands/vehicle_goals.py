@@ -18,7 +18,7 @@ ROBOT = "robot"
 MAP = "map"
 # where episodes start, see `RealtimeOptions.start`
 PRESENT = "present"
-# increase of a confirmed distance below which nobody is asked again [m]
+# increase of a confirmed distance that needs no new confirmation [m]
 NEAR_M = 0.5
 MARGIN_M = 10.0  # open ground beyond a goal [m]
 Say = Callable[[str], None]
@@ -34,7 +34,7 @@ class GoalOrder:
     """
 
     point: Point | None = None  # x, y [m]; None: each episode's goal in the world
-    # None: `robot` if episodes start at the present place, else `map`
+    # None: `robot` if episodes start at the current pose, else `map`
     frame: str | None = None
     start: str = defaults.VEHICLE_START  # `wait` or PRESENT
     localised: bool = False  # True: a pose sensor locates the robot in `map`
@@ -52,7 +52,7 @@ class GoalOrder:
 
     @property
     def needs_pose(self) -> bool:
-        """True if the distance of the goal depends on the present pose."""
+        """True if the distance of the goal depends on the current pose."""
         return self.start == PRESENT and not self.lays_map
 
     def ground(self, world: AnyWorld) -> AnyWorld:
@@ -67,7 +67,7 @@ class GoalOrder:
         )
 
     def episode(self, scene: Scene, present: Array | None = None) -> "VehicleEpisode":
-        """Returns start and goal of an episode; `present` is the robot's pose (3,) in `map`."""
+        """Returns start and goal of an episode; `present` is the current pose (3,) in `map`."""
         start = np.array(scene.starts[0])
         scene_goal = geometry.between(start, (*scene.goals[0][:2], 0.0))[:2]
         if self.start == PRESENT and present is not None:
@@ -108,7 +108,7 @@ class VehicleEpisode:
         return options
 
     def sentence(self) -> str:
-        """Describes where the vehicle has to stand and where it will drive."""
+        """Describes where to place the vehicle and where it will drive."""
         ahead, left = self.seen
         sides = f"{abs(ahead):.2f} m {'ahead' if ahead >= 0.0 else 'back'}"
         sides += f" and {abs(left):.2f} m to the {'left' if left >= 0.0 else 'right'}"
@@ -134,9 +134,7 @@ class VehicleEpisode:
         confirm(question)
 
 
-UNATTENDED = (
-    "say --yes to drive there without a question, or --confirm-beyond with more metres."
-)
+UNATTENDED = "use --yes to skip the question, or a larger --confirm-beyond."
 
 
 def confirm_at_terminal(question: str) -> None:

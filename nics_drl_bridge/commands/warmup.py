@@ -24,7 +24,7 @@ WheelOption = Annotated[
     bool,
     typer.Option(
         "--for-wheel",
-        help="All for x86-64-v3, into the package's folder, as `make wheel` does.",
+        help="All for x86-64-v3, into the package's folder, for `make wheel`.",
     ),
 ]
 
@@ -60,7 +60,7 @@ def warmup(
 
 
 def _begin(for_wheel: bool) -> None:
-    """Leaves Ctrl-C to the parent; for a wheel, code goes into the package's folder."""
+    """Leaves Ctrl-C to the parent; for a wheel, compiles into the package's folder."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if for_wheel:
         from nics_drl_bridge.kernels import compile_for_wheel

@@ -26,7 +26,7 @@ world = typer.Typer(
 SDF = (".world", ".sdf")
 MAPS = (".yaml", ".yml")
 PICTURES = (".png", ".pgm", ".bmp")
-# default height of the plane to import [m]: TurtleBot3's lidar is at 0.18 m
+# default height of the imported plane [m]; TurtleBot3's lidar is at 0.18 m
 HEIGHT = 0.2
 NAV2 = {
     "origin": [0.0, 0.0, 0.0],
@@ -75,7 +75,7 @@ def import_(
     out: Annotated[
         Path | None,
         Option(
-            help="The .yaml to write, or a folder; by default named after the file, here."
+            help="The .yaml to write, or a folder; by default in this folder, named after the file."
         ),
     ] = None,
     name: Annotated[
@@ -89,7 +89,7 @@ def import_(
     ] = None,
     goal: Annotated[
         tuple[float, float] | None,
-        Option(metavar="X Y", help="Where the goal lies [m]; else anywhere."),
+        Option(metavar="X Y", help="Position of the goal [m]; else anywhere."),
     ] = None,
     goal_distance: Annotated[
         tuple[float, float] | None,
@@ -105,14 +105,14 @@ def import_(
     height: Annotated[
         float,
         Option(
-            help="For SDF: height above z = 0 at which geometry counts, the lidar's [m]."
+            help="For SDF: height above z = 0 at which geometry is cut, the lidar's [m]."
         ),
     ] = HEIGHT,
     bounds: Annotated[
         tuple[float, float, float, float] | None,
         Option(
             metavar="X1 Y1 X2 Y2",
-            help="For SDF: the field [m]; else just all obstacles.",
+            help="For SDF: the field [m]; by default around all obstacles.",
         ),
     ] = None,
     without: Annotated[
@@ -127,7 +127,7 @@ def import_(
         bool,
         Option(
             "--skip-unknown",
-            help="For SDF: leave out, and list, meshes and other unknowns.",
+            help="For SDF: skip and list meshes and other unsupported shapes.",
         ),
     ] = False,
     resolution: Annotated[
@@ -156,8 +156,8 @@ def import_(
             written += _read_mapped(file, place, keys, resolution)
     for output in written:
         if output.path.exists():
-            fix = "remove it, or give another place as --out"
-            raise ConfigError(f"{output.path}: is there already; {fix}.")
+            fix = "remove it, or give another --out"
+            raise ConfigError(f"{output.path}: already exists; {fix}.")
     for output in written:
         write_text(output.path, output.text)
         if not as_json:
@@ -184,7 +184,7 @@ def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path,
     twice = {str(place) for place in places if places.count(place) > 1}
     if twice:
         raise ConfigError(
-            f"{min(twice)}: two files would be written there; import them in turn."
+            f"{min(twice)}: two files would be written there; import them one by one."
         )
     return dict(zip(files, places, strict=True))
 
@@ -199,7 +199,7 @@ def _read_standing(
         {"shapes": [group.shapes[0].model_dump(exclude_none=True)], "at": group.at}
         for group in standing.obstacles
     ]
-    head = [f"What stands in {file.name} at a height of {height:g} m."]
+    head = [f"Obstacles of {file.name} at a height of {height:g} m."]
     head += [f"Left out: {reason}." for reason in standing.left_out]
     derived = {"name": file.stem, "bounds": field, "obstacles": groups}
     text = _format_world(file, head, derived | keys, (x2 - x1, y2 - y1))
@@ -280,7 +280,7 @@ def _read_back(file: Path, text: str, obstacles: int) -> None:
     except ConfigError:
         if not obstacles:
             raise
-        reason = f"its {obstacles} bodies make a larger file than is read"
+        reason = f"its {obstacles} bodies make a file that is too large to be read"
         fix = "leave some out by --without MODEL, or split the world"
         raise ConfigError(f"{file}: {reason}; {fix}.") from None
     world = validate(data, World, made)
@@ -356,13 +356,13 @@ def map_(
     ] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the episode.")] = 0,
     robot: console.RobotOption = DEFAULT_ROBOT,
-    resolution: Annotated[float, Option(help="Greatest side of a cell [m].")] = 0.01,
+    resolution: Annotated[float, Option(help="Maximum side of a cell [m].")] = 0.01,
     as_json: console.JsonOption = False,
 ) -> None:
     """Writes the map of an episode for Nav2's map_server.
 
-    Moving obstacles are left out. `nics world map room`, then
-    `ros2 run nav2_map_server map_server --ros-args -p yaml_filename:=room_map.yaml`.
+    Moving obstacles are omitted. `nics world map room`, then `ros2 run nav2_map_server
+    map_server --ros-args -p yaml_filename:=room_map.yaml`.
     """
     with console.show_progress():
         from nics_drl_bridge.lidar.maps import map_files

@@ -1,6 +1,6 @@
-"""Arming and reset: what must be in order before commands may pass.
+"""Arming and reset: the checks that must pass before commands may pass.
 
-A request to arm is granted if no row of `CHECKS` objects; the answer to it names all that do.
+A request to arm is granted if all `CHECKS` pass; the answer names those that fail.
 """
 
 from collections.abc import Callable
@@ -20,8 +20,8 @@ from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 
 Check = Callable[[GateConfig, GateState, inputs.Arm, float], str]
-"""What is wrong at a request to arm; empty if nothing is."""
-BEHIND_S = 0.2  # by which irregular stamps may fall behind while the gate settles
+"""Returns the fault at a request to arm, or ""."""
+BEHIND_S = 0.2  # tolerated lag of irregular stamps while the gate settles [s]
 NEVER_HEARD = (
     "e_stop_silent: no e_stop was ever heard, which counts as pressed: publish it at 10 Hz or "
     "more, or in a simulation start the gate with e_stop_required:=false"
@@ -32,7 +32,7 @@ UNLIMITED = "no limits are set, name their file in `limits`"
 def arm(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> tuple[GateState, str, bool]:
-    """Arms the gate if all checks pass; returns also the answer, and whether it was granted."""
+    """Arms the gate if all checks pass; returns the state, the answer, and if it was granted."""
     faults = []
     for name, check in CHECKS:
         fault = check(config, state, request, now)
@@ -44,7 +44,7 @@ def arm(
 
 
 def _begin_drive(config: GateConfig, state: GateState) -> GateState:
-    """Returns the armed state: what was learned before says nothing about the coming drive.
+    """Returns the armed state, without what was learned before.
 
     Earlier views and known ground are forgotten, as somebody may have carried the robot here.
     """
@@ -74,7 +74,7 @@ def _begin_drive(config: GateConfig, state: GateState) -> GateState:
 
 
 def reset(state: GateState) -> tuple[GateState, str, bool]:
-    """Clears the latch and disarms; returns also the answer, and whether it was granted.
+    """Clears the latch and disarms; returns the state, the answer, and if it was granted.
 
     An emergency stop that is still pressed stays latched.
     """
@@ -98,7 +98,7 @@ def _check_sensors(
 def _check_odometry_rate(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
-    """Odometry comes at its rate; where none was declared, at least as often as is needed."""
+    """Odometry arrives at its declared rate, or by default at least as often as needed."""
     arrivals = state.odometries
     if config.odom_rate_declared:
         return _judge_rate(ODOM, arrivals, config.odom_rate, config, now)
@@ -113,7 +113,7 @@ def _check_odometry_rate(
 def _check_clocks(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
-    """The clocks that stamp scan and odometry agree, and keep pace with this machine's clock."""
+    """The clocks that stamp scan and odometry agree and keep pace with this machine's clock."""
     scans = state.scans
     odometries = state.odometries
     if not (scans.times and odometries.times):
@@ -139,7 +139,7 @@ def _check_clocks(
 def _check_estimator(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
-    """The middleware knows where the robot is, and that it stands still."""
+    """The middleware has a valid estimate of a robot at rest."""
     estimate = state.estimate
     if not config.estimate_required:
         return ""
@@ -233,13 +233,13 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("standing_still", _check_standing),
     ("one_policy", _check_policies),
 )
-"""By name: what must be in order before the gate is armed."""
+"""Checks before the gate is armed, by name."""
 
 
 def _judge_freshness(
     topic: str, arrivals: Arrivals, limit_s: float, config: GateConfig, now: float
 ) -> str:
-    """Data must have come without a gap for as long as the gate settles."""
+    """Data must have arrived without a gap for the settling time."""
     unbroken = now - arrivals.unbroken_s >= config.settle_s
     if arrivals.times and unbroken and now - arrivals.times[-1] <= limit_s:
         return ""
@@ -249,7 +249,7 @@ def _judge_freshness(
 def _judge_rate(
     topic: str, arrivals: Arrivals, declared: float, config: GateConfig, now: float
 ) -> str:
-    """Judges a rate: by stamps too few and too many data are wrong, by arrival only too few."""
+    """Judges a rate: by stamps it may be too low or too high, by arrival only too low."""
     arriving, stamped = stops.measure_rate(arrivals, now, config.settle_s)
     low = declared * (1.0 - config.rate_tolerance)
     high = declared * (1.0 + config.rate_tolerance)

@@ -20,15 +20,15 @@ from nics_drl_bridge.gate.state import Decision, GateConfig, GateState
 
 FORMAT = "nics_drl_bridge/black_box/4"
 LATEST_S = 1e12
-MOST_BYTES = 64 * 2**20  # greatest size of a file that is replayed
-# greatest number of values in such a file; 30 s of a gate have 100,000
+MOST_BYTES = 64 * 2**20  # maximum size of a file that is replayed
+# maximum number of values in such a file; 30 s of a gate have 100,000
 MOST_VALUES = 1_000_000
-# greatest number of inputs that are decided on again; each takes some 30 us
+# maximum number of inputs that are replayed; each takes about 30 us
 MOST_INPUTS = 20_000
 
 
 class Entry(NamedTuple):
-    """One input of the gate, at a steady time [s], the state before it, and the answer."""
+    """One input of the gate at a steady time [s], the state before it, and the decision."""
 
     now: float
     given: Input
@@ -65,12 +65,12 @@ class Replay(NamedTuple):
     """Content of a black box, with the recorded decisions."""
 
     entries: tuple[Entry, ...]
-    # indices of the entries that are now decided differently
+    # indices of the entries whose replayed decision differs
     differing: tuple[int, ...]
 
     @property
     def story(self) -> list[str]:
-        """One line for each change between passing and stopping, and one about the replay."""
+        """Returns a line per change between passing and stopping, and one about the replay."""
         if not self.entries:
             return ["no inputs"]
         end = self.entries[-1].now
@@ -93,7 +93,7 @@ class Replay(NamedTuple):
 
 
 def replay(path: str | Path) -> Replay:
-    """Decides again on every input in a file; ConfigError if it is no whole black box."""
+    """Repeats all decisions in a file. Raises ConfigError if it is not a complete black box."""
     head, *lines = _read_records(path)
     try:
         config = from_plain(head["config"])
@@ -129,7 +129,7 @@ def _explain_damage(path: str | Path, error: Exception) -> ConfigError:
 def _check_kinds(
     config: Any, state: Any, events: list[Any], recorded: list[Any]
 ) -> None:
-    """Raises TypeError or ValueError unless everything that was read belongs in a black box."""
+    """Raises TypeError or ValueError for content that does not belong in a black box."""
     if len(events) > MOST_INPUTS:
         raise ValueError(
             f"{len(events)} inputs, where at most {MOST_INPUTS} are replayed"
@@ -154,21 +154,21 @@ def _read_records(path: str | Path) -> list[dict[str, Any]]:
     values = sum(map(text.count, ",[{"))
     if values > MOST_VALUES:
         raise ConfigError(
-            f"{path}: holds {values} values, no black box more than {MOST_VALUES}."
+            f"{path}: contains {values} values; a black box has at most {MOST_VALUES}."
         )
     try:
         lines = [json.loads(line) for line in text.splitlines()]
     except (ValueError, RecursionError):
         raise ConfigError(
-            f"{path}: is no JSON, line by line; it can't be replayed."
+            f"{path}: is not JSON, line by line; it can't be replayed."
         ) from None
     if not lines or not isinstance(lines[0], dict) or lines[0].get("format") != FORMAT:
-        raise ConfigError(f"{path}: is no black box of the gate ({FORMAT}).")
+        raise ConfigError(f"{path}: is not a black box of the gate ({FORMAT}).")
     content = text.encode()
     rest = content[: -len(SEAL % hash_bytes(b"").encode())]
     if content != rest + SEAL % hash_bytes(rest).encode():
         raise ConfigError(
-            f"{path}: is damaged (its checksum does not fit); it can't be replayed."
+            f"{path}: is damaged (its checksum does not match); it can't be replayed."
         )
     return lines[:-1]
 
@@ -202,7 +202,7 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(value: Any) -> Any:
-    """Returns the record that `to_plain` was given. Raises ValueError if it is damaged."""
+    """Returns the record from `to_plain`'s output. Raises ValueError if it is damaged."""
     if isinstance(value, list):
         return tuple(from_plain(part) for part in value)
     if not isinstance(value, dict):

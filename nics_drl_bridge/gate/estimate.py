@@ -1,9 +1,9 @@
-"""Checks the estimate of the robot's pose: it must not jump, nor become uncertain quickly.
+"""Checks the estimate of the robot's pose: it must not jump or quickly become uncertain.
 
-Without a localiser the covariance of a pose in `map` grows for ever, by noise and by the distance
-from the origin at which the heading is uncertain. That says nothing about the next metres, and goal
-and scan are near. So only the part of the covariance counts that has been added since a recent
-estimate, or since arming.
+Without a localiser the covariance of a pose in `map` grows forever, by noise and by
+heading uncertainty times the distance from the origin. This does not matter for the
+next few metres, where goal and scan are. Therefore only the covariance added since a
+recent estimate, or since arming, counts.
 """
 
 import math
@@ -22,9 +22,9 @@ from nics_drl_bridge.gate.state import (
 )
 from nics_drl_bridge.geometry import between
 
-WINDOW_S = 10.0  # in which uncertainty is counted, but only since arming [s]
+WINDOW_S = 10.0  # window over which uncertainty is counted, but only since arming [s]
 ESTIMATE_MARK_S = 1.0  # time between two marks [s]
-SLIP = 2.0  # factor by which a robot may exceed its speeds
+SLIP = 2.0  # factor by which a robot may exceed its maximum speeds
 REMEDY = (
     "give the pose by `initialpose` or by the localiser, or call `middleware_node/~/reset`, then "
     "`~/reset` and `~/arm`"
@@ -40,7 +40,7 @@ class Growth(NamedTuple):
 
 def compute_growth(mark: EstimateMark, estimate: Estimate) -> Growth:
     """Returns the uncertainty of an estimate's pose relative to an earlier one."""
-    # An old error of the heading shifts the pose at right angles to the path since then.
+    # An old heading error shifts the pose at right angles to the path since then.
     x, y = (estimate.pose[:2] - mark.pose[:2]).tolist()
     carried = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
     gained = np.diag(estimate.covariance - carried @ mark.covariance @ carried.T)
@@ -51,7 +51,7 @@ def compute_growth(mark: EstimateMark, estimate: Estimate) -> Growth:
 def track_estimate(
     config: GateConfig, state: GateState, estimate: Estimate, now: float
 ) -> EstimateTrack:
-    """Returns the track with a new estimate, and what is wrong with that."""
+    """Returns the track with a new estimate and its fault, if any."""
     track = state.estimates
     newest = EstimateMark(now, estimate.pose, estimate.covariance)
     marks = tuple(mark for mark in track.marks if now - mark.time_s <= WINDOW_S)
@@ -69,7 +69,7 @@ def track_estimate(
 def _find_jump(
     config: GateConfig, before: Estimate, after: Estimate, passed_s: float
 ) -> str:
-    """Returns what is wrong with a pose that the robot can't have driven to, or nothing."""
+    """Returns the fault of a pose that the robot can't have reached, or ""."""
     x, y, turn = between(before.pose, after.pose).tolist()
     path = math.hypot(x, y)
     speed = math.inf
@@ -86,7 +86,7 @@ def _find_jump(
 def _explain_uncertainty(
     config: GateConfig, origin: EstimateMark, estimate: Estimate, now: float
 ) -> str:
-    """Returns by how much an estimate has become too uncertain; empty if it has not."""
+    """Returns the fault of an estimate that has become too uncertain, or ""."""
     growth = compute_growth(origin, estimate)
     if (
         growth.position <= config.estimate_position
@@ -111,7 +111,7 @@ def restart_track(state: GateState) -> EstimateTrack:
 
 
 def explain_unsteadiness(config: GateConfig, state: GateState, now: float) -> str:
-    """Returns why the gate can't be armed yet: the estimate was at fault a moment ago."""
+    """Returns why the gate can't be armed yet if the estimate was recently faulty."""
     track = state.estimates
     if not track.last_fault or now - track.marks[0].time_s >= config.settle_s:
         return ""
@@ -121,7 +121,7 @@ def explain_unsteadiness(config: GateConfig, state: GateState, now: float) -> st
 
 
 def estimate_lost(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The estimate jumped, or became uncertain in a short time: its localiser is lost."""
+    """The estimate jumped or quickly became uncertain: its localiser is lost."""
     fault = state.estimates.fault
     if not fault or not config.estimate_required:
         return None

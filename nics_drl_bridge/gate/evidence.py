@@ -1,18 +1,20 @@
-"""What counts as an obstacle: what the newest scan hits, and where the lidar can't see.
+"""Obstacles for the shield: the returns of the newest scan, and areas the lidar can't see.
 
-Obstacles are rows (P, 3): x, y [m] in the robot's frame, and the speed [m/s] at which each may
-approach, `obstacle_speed` for a mover and 0 for all else. `find_obstacles` collects them in these
-steps:
+Obstacles are rows (P, 3): x, y [m] in the robot's frame, and the speed [m/s] at which
+each may approach: `obstacle_speed` for a mover, otherwise 0. `find_obstacles` collects
+them in these steps:
 
-1. Compare the newest scan with earlier ones: a beam that ends where an earlier one saw free space
-   ends on a mover, which may approach. All other obstacles are static. A wrong motion in between
-   makes standing things seem to move, and wheels do slip (of a skid-steer in turns) and spin (of a
-   body that is held). So odometry's motion is replaced by another one if that clearly fits both
-   scans better. `scan_motion` judges by itself, over a longer time, whether a body is held.
+1. Compare the newest scan with earlier ones: a beam that ends where an earlier one saw
+   free space hits a mover, which may approach. All other obstacles are static. A wrong
+   motion estimate makes static objects appear to move, and wheels do slip (in turns of
+   a skid-steer robot) and spin (if the body is held). The motion by odometry is
+   therefore replaced if another one clearly fits both scans better. `scan_motion`
+   decides separately, over a longer time, whether the body is held.
 2. Place an obstacle at the end of each beam that returns.
 3. Place one at the minimum range of each beam that was too close to measure.
 4. Place a wall on the footprint wherever too many beams are unknown.
-5. Add the border of known ground, for a lidar that does not look all around; see `ground`.
+5. Add the border of known ground if the lidar does not cover the full circle; see
+   `ground`.
 """
 
 import math
@@ -39,28 +41,29 @@ from nics_drl_bridge.interface import S_PER_NS, Array
 Flags = NDArray[np.bool_]
 FULL_CIRCLE = 2.0 * math.pi
 MEMORY_S = 0.45  # maximum age of a scan that the newest one is compared with [s]
-SPACING_S = 0.09  # minimum time between two such scans that are kept [s]
-# The place where a beam ends was free if the old scan saw further in that direction, by this [m]
-# plus this many standard deviations of its range.
+SPACING_S = 0.09  # minimum time between two such scans [s]
+# The end of a beam was free space if the old scan saw further in that direction, by
+# this length [m] plus this many standard deviations of its range.
 TOLERANCE = 0.03
 DEVIATIONS = 3.0
-# The motion between two scans: odometry is believed in smaller turns and shorter paths, because
+# Odometry is trusted for smaller turns and shorter paths between two scans, because
 # their errors are within the angle and the distance over which beams are compared.
 MIN_CHECKED_TURN = evidence_kernels.COMPARED_ANGLE
 MIN_CHECKED_PATH = TOLERANCE
-MAX_TURN_FRACTION = 1.3  # of the turns that are tried, over odometry's
-TURN_SPACING = 0.03  # between two turns that are tried, at most [rad]
+MAX_TURN_FRACTION = 1.3  # maximum turn that is tried, relative to odometry's
+TURN_SPACING = 0.03  # maximum spacing of the turns that are tried [rad]
 MIN_TURNS = 14  # minimum number of turns that are tried
-PATH_SPACING = 0.05  # between two lesser motions that are tried, at most [m]
-MIN_LESSER = 4  # minimum number of lesser motions that are tried
-MAX_LESSER = 20  # maximum number of them, whatever odometry shows
+PATH_SPACING = 0.05  # maximum spacing of the smaller motions that are tried [m]
+MIN_LESSER = 4  # minimum number of smaller motions that are tried
+MAX_LESSER = 20  # maximum number of them
 COMPARED_BEAMS = 200  # number of beams that suffice to compare motions
-# Another motion than odometry's must let this fraction of all compared beams agree, and more beams
-# than odometry's does, by this fraction of all compared ones.
+# A motion may replace odometry's if this fraction of the compared beams agrees with it,
+# and more beams than with odometry's, by this fraction of the compared beams.
 MIN_AGREEING = 0.3
 MIN_GAIN = 0.05
-# The beams that agree by that motion, but not by odometry's, must lie in so many sectors of an
-# eighth of a circle, each with so many beams: a person who walks around the robot is no turn of it.
+# The beams that agree with that motion, but not with odometry's, must be in at least
+# this many eighths of a circle, each with at least this many beams, so that a person
+# who walks around the robot is not mistaken for its turn.
 SECTORS = 8
 MIN_SECTORS = 4
 MIN_SECTOR_BEAMS = 2
@@ -77,8 +80,9 @@ def find_obstacles(
     Args:
         config: of the gate.
         ranges: (B,) of the scan [m].
-        views: of recent scans, with this one as the newest; empty without odometry.
-        ground: what is known of the ground; None if the lidar looks all around.
+        views: recent views, including this scan's as the newest; empty without
+            odometry.
+        ground: known ground; None if the lidar covers the full circle.
     """
     shield = config.shield
     if shield is None:
@@ -95,7 +99,7 @@ def find_obstacles(
 def find_movers(
     config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]
 ) -> Flags:
-    """Returns which beams (B,) of the newest view end on movers; a beam beside has to, too."""
+    """Returns which beams (B,) of the newest view hit movers, together with a neighbour."""
     newest = views[-1]
     entered = np.zeros(len(newest.ranges), np.bool_)
     if shield.obstacle_speed == 0.0:
@@ -117,7 +121,7 @@ def find_movers(
 
 
 def _has_entered_neighbour(entered: Flags, lidar: MountedBeams) -> Flags:
-    """Returns whether a beam beside each one (B,) is marked; of a full circle, the ends adjoin."""
+    """Returns whether a neighbour of each beam (B,) is marked; a full circle wraps around."""
     before = np.roll(entered, 1)
     after = np.roll(entered, -1)
     is_full_circle = (len(entered) + 0.5) * abs(lidar.step) > FULL_CIRCLE
@@ -132,9 +136,9 @@ def estimate_motion(
 ) -> Array:
     """Returns the robot's motion (3,) between two views, by odometry and the scans.
 
-    Of the motions that wheels may show by mistake, it is the one by which most beams of the new
-    scan end where the old scan ended. Odometry's own is taken unless another one lets clearly more
-    beams agree, and in several directions.
+    Among the motions that wheels may report by mistake, it is the one for which most
+    beams of the new scan end where the old scan ended. Odometry's own motion is used
+    unless clearly more beams agree with another one, in several directions.
     """
     by_odometry = between(old.pose, new.pose)
     path = math.hypot(by_odometry[0], by_odometry[1])
@@ -157,11 +161,11 @@ def estimate_motion(
         MIN_AGREEING * compared,
     )
     if np.count_nonzero(is_return) < needed:
-        return by_odometry  # no motion can be better
+        return by_odometry  # no motion can fit better
     motions = np.concatenate([_vary_turn(by_odometry), _lessen_motion(by_odometry)])
     agreeing = np.stack([find_agreeing(motion) for motion in motions])
     counts = np.count_nonzero(agreeing, axis=1)
-    best = int(np.argmax(counts))  # of several, the turn nearest to odometry's
+    best = int(np.argmax(counts))  # among equals, the turn closest to odometry's
     gained = np.flatnonzero(agreeing[best] & ~agreeing_by_odometry) * stride
     if counts[best] < needed or _count_sectors(gained, lidar) < MIN_SECTORS:
         return by_odometry
@@ -170,7 +174,7 @@ def estimate_motion(
 
 
 def _vary_turn(motion: Array) -> Array:
-    """Returns motions (n, 3) like one, with other turns; those nearest to its own turn first."""
+    """Returns motions (n, 3) with other turns, sorted by the change of the turn."""
     span = MAX_TURN_FRACTION * abs(float(motion[2]))
     count = max(MIN_TURNS, math.ceil(span / TURN_SPACING) + 1)
     fractions = np.linspace(0.0, MAX_TURN_FRACTION, count)
@@ -181,7 +185,7 @@ def _vary_turn(motion: Array) -> Array:
 
 
 def _lessen_motion(motion: Array) -> Array:
-    """Returns motions (n, 3) that are fractions of one, from none on: of wheels that spin."""
+    """Returns fractions (n, 3) of a motion from zero on, as if the wheels spin."""
     arc = log(motion)
     path = math.hypot(arc[0], arc[1])
     count = min(max(MIN_LESSER, math.ceil(path / PATH_SPACING)), MAX_LESSER)
@@ -190,7 +194,7 @@ def _lessen_motion(motion: Array) -> Array:
 
 
 def _count_sectors(beams: NDArray[np.intp], lidar: MountedBeams) -> int:
-    """Returns the number of sectors around the lidar that hold enough of the beams (n,)."""
+    """Returns the number of sectors around the lidar that contain enough of the beams (n,)."""
     bearings = np.mod(lidar.first + beams * lidar.step, FULL_CIRCLE)
     sectors = (bearings / FULL_CIRCLE * SECTORS).astype(np.intp) % SECTORS
     counts = np.bincount(sectors, minlength=SECTORS)
@@ -200,7 +204,7 @@ def _count_sectors(beams: NDArray[np.intp], lidar: MountedBeams) -> int:
 def place_returns(
     config: GateConfig, shield: ShieldConfig, ranges: Ranges, is_mover: Flags
 ) -> Array:
-    """Returns an obstacle at the end of each beam that returns."""
+    """Returns an obstacle at the end of each beam with a return."""
     is_return = np.isfinite(ranges)
     angles = config.beam_angles[is_return]
     lengths = ranges[is_return].astype(np.float64)
@@ -223,8 +227,8 @@ def place_unknown(
 ) -> Array:
     """Returns a wall on the footprint wherever too many beams, or all, are unknown (NaN).
 
-    The beams within `unknown_width` count together. Towards the edge of the lidar's view, and
-    beyond it, fewer beams are expected.
+    The beams within `unknown_width` are counted together. At and beyond the edge of the
+    field of view, fewer beams are expected.
     """
     bearings, points = sample_footprint(shield, config.mount, len(ranges))
     angles = config.beam_angles + config.mount[2]
@@ -238,7 +242,7 @@ def place_unknown(
 
 
 EVIDENCE = (place_returns, place_too_close, place_unknown)
-"""What counts as an obstacle in a scan, each as rows (P, 3)."""
+"""Functions that find obstacles (P, 3) in a scan."""
 
 
 def _place_at_ends(
@@ -260,7 +264,7 @@ def make_static(points: Array) -> Array:
 def _count_within(
     bearings: Array, angles: Array, half_width: float
 ) -> NDArray[np.int64]:
-    """Returns how many angles (B,) lie within half a width of each bearing (M,) [rad]."""
+    """Returns how many angles (B,) are within half a width of each bearing (M,) [rad]."""
     angles = np.sort(np.mod(angles + np.pi, 2.0 * np.pi) - np.pi)
     unrolled = np.concatenate([angles - 2.0 * np.pi, angles, angles + 2.0 * np.pi])
     begin = np.searchsorted(unrolled, bearings - half_width)
@@ -275,7 +279,7 @@ def get_beams(config: GateConfig) -> MountedBeams:
 
 
 def add_view(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ...]:
-    """Returns the earlier views that still count, oldest first, then that of a new scan."""
+    """Returns the earlier views in use, oldest first, and the view of a new scan."""
     if config.shield is None or state.odometry is None:
         return ()
     pose = extrapolate_pose(state.odometry, scan.stamp_ns, MEMORY_S)

@@ -1,4 +1,4 @@
-"""Compiled: compares the ends of a scan's beams with what an earlier scan saw there.
+"""Compiled: compares the ends of a scan's beams with an earlier scan.
 
 - `mark_agreeing` marks the beams that end where the old scan ended.
 - `mark_entered` marks those that end in space that the old scan showed to be free.
@@ -15,12 +15,12 @@ from nics_drl_bridge.kernels import kernel
 
 Ranges = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-# Beams of the old scan within this angle of a place show whether it was free [rad].
+# Beams of the old scan within this angle of a point show whether it was free [rad].
 COMPARED_ANGLE = 0.02
 
 
 class MountedBeams(NamedTuple):
-    """The beams of a lidar, and where it is mounted on the robot.
+    """The beams of a lidar, and its mount on the robot.
 
     Attributes:
         first: angle of beam 0 in the lidar's frame [rad].
@@ -56,7 +56,7 @@ def mark_entered(
 ) -> None:
     """Marks the beams of a scan that end where an old scan saw free space.
 
-    Beams that end in places which the old scan did not show stay as they are.
+    Beams that end outside the view of the old scan stay unmarked.
 
     Args:
         entered: (B,) flags, set for these beams.
@@ -125,7 +125,7 @@ def mark_agreeing(
 def find_in_old_scan(
     length: float, beam: int, lidar: MountedBeams, moved: Array
 ) -> tuple[float, int]:
-    """Returns the place where a beam ends, as the lidar saw it at the old scan.
+    """Returns the end of a beam, as seen from the lidar at the old scan.
 
     Args:
         length: range of the beam [m].
@@ -135,8 +135,8 @@ def find_in_old_scan(
 
     Returns:
         distance: from the lidar at the old scan [m].
-        index: of the beam that points there, as if the beams went all around; it may be one whole
-            circle.
+        index: of the beam that points there, as if the beams covered the full circle; it may be
+            one full circle.
     """
     angle = lidar.first + beam * lidar.step + lidar.heading
     x = lidar.x + length * math.cos(angle)

@@ -1,4 +1,4 @@
-"""The robot's footprint: as the shield sweeps it, and as a row of points."""
+"""The robot's footprint: as a body for the shield to sweep, and as points."""
 
 import math
 from functools import cache
@@ -31,7 +31,7 @@ def get_body(shield: ShieldConfig) -> Body:
 def sample_footprint(
     shield: ShieldConfig, mount: tuple[float, float, float], count: int
 ) -> tuple[Array, Array]:
-    """Returns points around the footprint, as the lidar sees them.
+    """Returns points around the footprint, with their bearings from the lidar.
 
     Args:
         shield: whose footprint it is.

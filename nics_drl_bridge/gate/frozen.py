@@ -1,6 +1,7 @@
-"""Data that arrive but are dead: repeated scans, jumps of odometry, no motion when commanded."""
-# Between two long walls, a lidar without noise may show the same scan again. So the old scan is
-# moved by odometry, and only beams count whose length must have changed.
+"""Data that arrive but are invalid: repeated scans, odometry jumps, no commanded motion."""
+# Between two long walls, a noise-free lidar may repeat a scan. The old scan is
+# therefore moved by odometry, and only beams whose length must have changed are
+# compared.
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,28 +21,29 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 
 Flags = NDArray[np.bool_]
-IDENTICAL = 3  # minimum number of scans that show a frozen picture
-PICTURES = 16  # number of remembered pictures; a lidar may cycle through several
+IDENTICAL = 3  # minimum number of identical scans that count as frozen
+PICTURES = 16  # number of remembered scans; a lidar may cycle through several
 RESPONSE = (
     0.1  # minimum fraction of the commanded distance or angle that a robot covers
 )
 # minimum motion commanded within the window for the robot to be judged [m], [rad]
 MIN_PATH = 0.03
 MIN_TURN = 0.25
-WINDOW = 0.75  # fraction of `stuck_s` that the window takes; the rest is for odometry's delay
+WINDOW = 0.75  # window as a fraction of `stuck_s`; the rest allows for odometry's delay
 MARK_S = 0.05  # between two marks
-PAUSE_S = 0.2  # least time without motion between pushes [s]
+PAUSE_S = 0.2  # minimum time without motion between pushes [s]
 # A robot slower than this, plus the noise of its odometry, stands still [m/s], [rad/s].
 REST_SPEED = 0.05
 REST_TURN_RATE = 0.1
-NOISE = 3.0  # noise of odometry that is allowed for, in standard deviations
+NOISE = 3.0  # tolerated noise of odometry, in standard deviations
 
 
 def watch_pictures(
     config: GateConfig, seen: tuple[Sameness, ...], ranges: Ranges, pose: Array | None
 ) -> tuple[tuple[Sameness, ...], str]:
-    """Returns the pictures with a scan (B,), newest last, and why it is an old one, or ""."""
-    # Bit for bit; one without returns is ignored. The pose (3,) is None before the first odometry.
+    """Returns the remembered scans with a new one (B,), and why it is frozen, or ""."""
+    # Compares bit for bit; scans without returns are ignored. The pose (3,) is None
+    # before the first odometry.
     if not np.isfinite(ranges).any():
         return seen, ""
     new_picture = Sameness(ranges, 1, pose)
@@ -66,7 +68,7 @@ def watch_pictures(
             f"{picture.count} scans are the same over a motion of {path:.2f} m or rad"
         )
         return (*others, picture), fault
-    # The scene may really look the same.
+    # The scene itself may look the same.
     return (*others, new_picture), ""
 
 
@@ -94,7 +96,7 @@ def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:
     marks = push.marks
     if now - marks[-1][0] >= MARK_S:
         start = now - WINDOW * config.stuck_s
-        # The first mark that is kept lies at or before the start of the window.
+        # The first remaining mark is at or before the start of the window.
         later = (k for k, (time, _, _) in enumerate(marks[1:]) if time > start)
         first = next(later, len(marks) - 1)
         marks = (*marks[first:], (now, commanded, state.odometry.pose))
@@ -105,7 +107,7 @@ def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:
 
 
 def odom_jumped(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """Odometry reports a pose that the robot can't have driven to."""
+    """Odometry reports a pose that the robot can't have reached."""
     return make_cause("odom_jumped", ODOM, state.leap)
 
 
@@ -125,7 +127,7 @@ def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
     turn = abs(float(commanded[2]))
     if path < MIN_PATH and turn < MIN_TURN:
         return None
-    for _, _, pose in push.marks:  # forth and back is motion, too
+    for _, _, pose in push.marks:  # moving back and forth also counts as motion
         moved = between(pose, state.odometry.pose)
         drove = path >= MIN_PATH and np.hypot(moved[0], moved[1]) >= RESPONSE * path
         turned = turn >= MIN_TURN and abs(moved[2]) >= RESPONSE * turn
@@ -138,10 +140,10 @@ def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
 
 # two scans with this fraction of equal beams are the same; one beam may always differ
 SAME_FRACTION = 0.99
-# a scan is old if this fraction of the beams that must have changed did not
+# a scan is frozen if this fraction of the beams that must have changed did not
 FROZEN_FRACTION = 0.9
 CHANGE = 0.02  # minimum change of a beam that must have changed [m]
-# errors of odometry for all of which a beam must have changed [rad]
+# heading errors of odometry; a beam must have changed under all of them [rad]
 HEADING_ERRORS = (-0.03, 0.0, 0.03)
 # an old beam is compared with beams at most this many beam spacings away
 NEIGHBOURS = 1.5
@@ -155,7 +157,7 @@ def is_same_scan(old: Ranges, new: Ranges) -> bool:
 
 
 def _match_but_for_one(same: Flags, counted: Flags, fraction: float) -> bool:
-    """True if this fraction of the counted beams is the same, or all but one of them."""
+    """True if this fraction of the counted beams is the same, or all except one."""
     equal = int(np.count_nonzero(same))
     count = int(np.count_nonzero(counted))
     return equal > 0 and equal >= min(fraction * count, count - 1)
@@ -189,7 +191,9 @@ def _find_changed(angles: Array, ranges: Ranges, ends: Array, is_open: Flags) ->
     """
     bearing = np.arctan2(ends[:, 1], ends[:, 0])
     order = np.argsort(bearing)
-    order = np.concatenate([order[-1:], order, order[:1]])  # the ends, once more around
+    order = np.concatenate(
+        [order[-1:], order, order[:1]]
+    )  # wrap around by one at both ends
     bearing = bearing[order]
     is_open = is_open[order]
     turn = 2.0 * np.pi

@@ -1,13 +1,14 @@
-"""The gate: decides on every input whether, and how far, the policy's command may move the robot.
+"""The gate: decides on every input whether the policy's command passes, and shapes it.
 
-`decide` is a pure function from (configuration, state, input, time) to (state, decision), which a
-replay repeats to the bit. For each input it goes through these steps:
+`decide` is a pure function from (configuration, state, input, time) to (state,
+decision), so that a replay is bit-identical. For each input it takes these steps:
 
 1. Take its time, and note whether the gate's own clock is at fault.
-2. Take it into the state, or refuse it; see `intake`.
+2. Add it to the state, or refuse it; see `intake`.
 3. Arm or reset, if requested; see `arming`.
-4. Stop, if a row of `STOPS` finds a cause. A stop is a zero at once: limits of rate and jerk apply
-   to motion. It is published at the input that causes it, and at every tick while it lasts.
+4. Stop, if a row of `STOPS` finds a cause. A stop is an immediate zero, since limits of
+   rate and jerk apply only to motion. It is published at the input that causes it, and
+   at every tick while it lasts.
 5. Otherwise, at a tick of the gate's clock, publish the newest command after all `SHAPERS`.
 """
 
@@ -72,9 +73,10 @@ def decide(
 def _find_causes(
     config: GateConfig, state: GateState, now: float
 ) -> tuple[Cause | None, Cause | None]:
-    """Returns the first cause of a stop, which names it, and the first one that latches."""
+    """Returns the first cause of a stop, after which it is named, and the first latching one."""
     first = None
-    # A latching rule counts behind any other one, because its fault may show at one input only.
+    # Latching rules are checked even after another cause, because their fault may last
+    # for one input only.
     for rule in STOPS:
         if rule.needs_clock and state.clock_fault:
             continue
@@ -113,7 +115,7 @@ def _stop(
 def _move(
     config: GateConfig, state: GateState, now: float
 ) -> tuple[GateState, Cause | None]:
-    """Returns the state after the newest command passed, or a stop and its cause if unfit."""
+    """Returns the state after the newest command passes, or after a stop and its cause."""
     zero = np.zeros(len(config.fields))
     target = zero
     if state.command is not None:
@@ -139,7 +141,8 @@ class Rule(NamedTuple):
     """A reason to stop.
 
     Attributes:
-        judge: returns the cause of a stop at a time [s], or None; its name is that of the rule.
+        judge: function that returns the cause of a stop at a time [s], or None; the
+            rule has its name.
         latches: the stop stays until a reset.
         needs_clock: it latches by elapsed time, so it is not judged while the gate's clock is at
             fault. Other rules may judge a wrong age: `own_clock` stops the robot anyway.
@@ -183,7 +186,7 @@ STOPS: tuple[Rule, ...] = (
     Rule(stops.scan_behind_unknown),
     Rule(stops.scan_behind_old),
 )
-"""The first rule that returns a cause names the stop; the first latching one latches it."""
+"""The first rule that returns a cause names the stop; the first latching cause latches it."""
 
 
 def saturate(
@@ -211,7 +214,7 @@ def follow(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
 def bound(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
     """Replaces a motion that is not finite or beyond its limits by zero, whatever came before.
 
-    What is denormal becomes zero as well.
+    Denormal values also become zero.
     """
     is_within = config.limits is None or limits.is_within(motion.value, config.limits)
     if (

@@ -19,10 +19,10 @@ FIRST_NS = interface.NS_PER_S  # the clock at the beginning of an episode
 class GatedBackend:
     """Passes commands on as `command_gate` would, armed at the beginning of each episode.
 
-    The gate decides once per control period, at its beginning, on what the robot sees and the
-    command. Limits are a shipped file or a YAML file, which may hold the shield. In `info`,
-    `stopped_by` is the rule that stopped a command, or "", and `shielded` is True if the shield
-    reduced it.
+    The gate decides once at the beginning of each control period, from the robot's view
+    and the command. Limits are a shipped file or a YAML file, which may include the
+    shield. In `info`, `stopped_by` is the rule that stopped a command, or "", and
+    `shielded` is True if the shield reduced it.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class GatedBackend:
     def step(
         self, command: interface.Array
     ) -> tuple[interface.RobotView, dict[str, Any]]:
-        """Applies what the gate makes of a command for one period; see `interface.Backend`."""
+        """Applies the gate's output for a command for one period; see `interface.Backend`."""
         robot = self._model.robot
         self._give(inputs.Command(self._now_ns, robot.to_cmd_vel(command)))
         decision = self._give(inputs.Tick())

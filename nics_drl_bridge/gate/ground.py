@@ -1,12 +1,12 @@
-"""Ground where the lidar never looks: free as far as it was seen, or the robot stood there.
+"""Ground outside the lidar's view: free where it was seen, or covered by the robot.
 
-It is kept in square cells, in the frame of odometry, each with the time when it was last known to
-be free. A new scan changes them in these steps:
+It is stored in square cells in the frame of odometry, each with the time when it was
+last known to be free. A new scan changes them in these steps:
 
-1. Shift the cells, so that the robot is in the middle again.
-2. Forget what was seen too long ago, except beside the robot.
-3. Mark as free what the scan shows, and as not free where its beams end.
-4. Mark as free where the robot stands.
+1. Shift the cells to centre them on the robot.
+2. Forget cells that were seen too long ago, except next to the robot.
+3. Mark cells that the scan shows as free, and cells where beams end as not free.
+4. Mark cells under the robot as free.
 5. Find the border of what is known, which counts as an obstacle.
 """
 
@@ -29,18 +29,18 @@ CELL = 0.05  # width of a cell [m]
 CELLS = 48  # minimum number of cells along each side of the ground that is remembered
 # Ground is remembered at least this far beyond the robot and its margin [m].
 REACH_BEYOND = 0.6
-# time after which ground is forgotten, except beside the robot [s]
+# time after which ground is forgotten, except next to the robot [s]
 REMEMBERED_S = 30.0
-MEDIAN_BEAMS = 5  # neighbouring beams whose median counts, because a single one may err
+MEDIAN_BEAMS = 5  # number of beams in a median, because a single one may be wrong
 NO_OUTLINE = Outline(np.zeros((0, 2)), 0, 0)  # of a body that is a circle
 
 
 def update_ground(
     config: GateConfig, views: tuple[View, ...], before: Ground | None
 ) -> Ground | None:
-    """Returns the ground known after the newest view; None if the lidar looks all around.
+    """Returns the ground known after the newest view; None if the lidar covers the full circle.
 
-    Without earlier ground, that around the robot may be free.
+    Without earlier ground, the area around the robot is assumed to be free.
     """
     shield = config.shield
     if shield is None or not views or _looks_all_around(config, shield):
@@ -106,7 +106,8 @@ def observe_ground(
 def _find_nearest(ranges: Ranges, lidar: MountedBeams) -> float:
     """Returns the distance [m] from the robot to the nearest end of the beams (B,).
 
-    It is the smallest median of neighbours, so that a single beam may err.
+    It is the smallest median of neighbours, so that a single wrong beam does not
+    matter.
     """
     angles = lidar.first + lidar.step * np.arange(len(ranges)) + lidar.heading
     # Beams that are too close to measure end at the lidar.

@@ -21,7 +21,7 @@ Flags = NDArray[np.bool_]
 
 
 class Grid(NamedTuple):
-    """Where the cells lie, as seen from the robot.
+    """Position of the cells relative to the robot.
 
     Attributes:
         x: from the robot to the first corner, along x of odometry [m].
@@ -40,7 +40,7 @@ class Grid(NamedTuple):
 
 @kernel(allocates=True)
 def shift_cells(times: Ranges, columns_moved: int, rows_moved: int) -> Ranges:
-    """Returns times (n, n) of cells that moved by so many columns and rows; -inf of new ones."""
+    """Returns the times (n, n) shifted by columns and rows; -inf for new cells."""
     shifted = np.full(times.shape, -np.inf, times.dtype)
     rows, columns = times.shape
     for i in range(max(0, -rows_moved), min(rows, rows - rows_moved)):
@@ -55,7 +55,7 @@ def forget_old(
 ) -> None:
     """Forgets cells that were last known to be free before `oldest` [s].
 
-    Known cells within `kept_radius` [m] of the robot are as good as known now.
+    Known cells within `kept_radius` [m] of the robot count as known now.
     """
     for i in range(times.shape[0]):
         for j in range(times.shape[1]):
@@ -76,7 +76,7 @@ def mark_seen(
     tolerance: float,
     now: float,
 ) -> Flags:
-    """Notes which cells a scan (B,) shows to be free; returns which ones it looks at as a whole.
+    """Marks cells that a scan (B,) shows to be free; returns those that are fully in view.
 
     All beams towards a cell must be longer than its distance and a tolerance [m]. Cells in which
     beams end are not free.
@@ -109,7 +109,7 @@ def mark_seen(
 def _clear_returns(
     times: Ranges, grid: Grid, ranges: Ranges, lidar: MountedBeams
 ) -> None:
-    """Notes that cells in which beams (B,) end are not free."""
+    """Marks cells in which beams (B,) end as not free."""
     for b in range(len(ranges)):
         if np.isfinite(ranges[b]):
             angle = lidar.first + b * lidar.step + lidar.heading
@@ -123,7 +123,7 @@ def _clear_returns(
 
 @kernel
 def mark_covered(times: Ranges, grid: Grid, body: Body, now: float) -> None:
-    """Notes that the cells under the footprint are free."""
+    """Marks the cells under the footprint as free."""
     for i in range(times.shape[0]):
         for j in range(times.shape[1]):
             x, y = _locate_cell(i, j, grid)
@@ -134,9 +134,9 @@ def mark_covered(times: Ranges, grid: Grid, body: Body, now: float) -> None:
 
 @kernel(allocates=True)
 def find_unseen(times: Ranges, is_seen: Flags, grid: Grid) -> Array:
-    """Returns the middles (Q, 2) of the cells in which free or seen ground ends [m].
+    """Returns the centres (Q, 2) of the cells at the border of free or visible ground [m].
 
-    What lies beyond the outermost cells is not known.
+    Everything outside the outermost cells is unknown.
     """
     last_i = times.shape[0] - 1
     last_j = times.shape[1] - 1
@@ -163,7 +163,7 @@ def find_unseen(times: Ranges, is_seen: Flags, grid: Grid) -> Array:
 
 @kernel
 def _locate_cell(i: int, j: int, grid: Grid) -> tuple[float, float]:
-    """Returns the middle of a cell in the robot's frame [m]."""
+    """Returns the centre of a cell in the robot's frame [m]."""
     dx = grid.x + (j + 0.5) * grid.width
     dy = grid.y + (i + 0.5) * grid.width
     return grid.cosine * dx + grid.sine * dy, grid.cosine * dy - grid.sine * dx
@@ -171,7 +171,7 @@ def _locate_cell(i: int, j: int, grid: Grid) -> tuple[float, float]:
 
 @kernel
 def _find_beam(x: float, y: float, lidar: MountedBeams) -> int:
-    """Returns the index of the beam towards a point, beyond those of a scan if there is none."""
+    """Returns the index of the beam towards a point, out of range if there is none."""
     circle = 2.0 * math.pi / abs(lidar.step)  # in beams
     angle = math.atan2(y - lidar.y, x - lidar.x)
     bearing = (angle - lidar.heading - lidar.first) / lidar.step

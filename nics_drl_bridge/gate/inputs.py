@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 
-# topics of the inputs, besides those of further sensors
+# topics of the inputs, except those of additional sensors
 ESTIMATE = "odometry/filtered"
 RAW = "cmd_vel_raw"
 E_STOP = "e_stop"
@@ -34,11 +34,11 @@ class Odometry:
 
 @dataclass(frozen=True)
 class SensorReading:
-    """A reading of a further sensor arrived."""
+    """A reading of an additional sensor arrived."""
 
     stamp_ns: int  # of its header
     name: str
-    points: Array  # (Q, 2) where it shows something in `base_link` [m]
+    points: Array  # (Q, 2) points in `base_link` that it shows [m]
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,7 @@ class Estimate:
 
     twist: Array  # (3,) vx [m/s], vy [m/s], wz [rad/s]
     pose: Array  # (3,) x [m], y [m], heading [rad] in `map`
-    covariance: (
-        Array  # (3, 3) of that pose, which grows with the way from the origin of `map`
-    )
+    covariance: Array  # (3, 3) of that pose, which grows with the distance from the origin of `map`
 
 
 @dataclass(frozen=True)
@@ -58,9 +56,9 @@ class Command:
 
     stamp_ns: int  # of the scan it was computed from
     twist: Array  # (3,) linear.x, linear.y, angular.z of `cmd_vel`
-    # its publisher, in words; empty if the middleware does not tell it
+    # its publisher, in words; empty if the ROS middleware does not report it
     source: str = ""
-    publishers: int = 1  # then: how many publish on its topic
+    publishers: int = 1  # if empty: number of publishers on its topic
 
 
 @dataclass(frozen=True)
@@ -72,9 +70,9 @@ class EStop:
 
 @dataclass(frozen=True)
 class Press:
-    """The emergency stop was pressed by a service call, or may have been pressed unheard."""
+    """The emergency stop was pressed by a service call, or a press may have been missed."""
 
-    reason: str = ""  # why it may have been; empty for a service call
+    reason: str = ""  # why a press may have been missed; empty for a service call
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,12 @@
-"""Takes the inputs of the gate into its state, or refuses those that can't be used.
+"""Adds the inputs of the gate to its state, or refuses those that can't be used.
 
 `take` goes through these steps for each input:
 
-1. Clear the faults of the input before, which live for one input only.
-2. Refuse it if a row of `REFUSALS` finds it malformed, or if its stamp repeats or jumps. Data that
-   are refused feed no watchdog.
-3. Record it, with all that follows from it: a new scan, for one, shows obstacles and ground.
+1. Clear the faults of the previous input, which last for one input only.
+2. Refuse it if a row of `REFUSALS` finds it malformed, or if its stamp repeats or
+   jumps. Refused data do not feed a watchdog.
+3. Record it and everything derived from it: a new scan, for example, shows obstacles
+   and ground.
 """
 
 from collections.abc import Callable
@@ -33,11 +34,12 @@ Taken = tuple[GateState, str]
 MAX_SPEED = 100.0
 # maximum deviation of the last beam from its declared angle [rad]
 ANGLE_TOLERANCE = 1e-3
-# Downhill or pushed, a robot may exceed its limits by this factor, and by this [m/s], [rad/s].
+# Downhill or when pushed, a robot may exceed its limits by this factor plus this [m/s],
+# [rad/s].
 EXCESS_FACTOR = 2.0
 EXCESS_SPEED = 0.5
 EXCESS_TURN_RATE = 1.0
-# jump of an odometry pose that may come from imprecision [m], [rad]
+# jump of an odometry pose that may be due to imprecision [m], [rad]
 SMALL_JUMP = 0.1
 SMALL_JUMP_TURN = 0.2
 
@@ -45,14 +47,14 @@ SMALL_JUMP_TURN = 0.2
 def take(
     config: GateConfig, state: GateState, event: inputs.Input, now: float
 ) -> Taken:
-    """Takes an input at a steady time [s] into the state, or returns the reason why not."""
+    """Adds an input at a steady time [s] to the state, or returns the reason for a refusal."""
     state = _clear_faults(state)
     if isinstance(event, inputs.Command):
         state = stops.watch_source(state, event, now)
     reason = _find_refusal(config, event)
     if reason:
         if isinstance(event, inputs.Command):
-            # An earlier command that waits for its scan must not come into force any more.
+            # An earlier command that waits for its scan must no longer take effect.
             state = replace(state, malformed=reason, pending=None, pending_s=None)
         return state, reason
     if isinstance(event, inputs.Scan):
@@ -81,7 +83,7 @@ def take(
 
 
 def _clear_faults(state: GateState) -> GateState:
-    """Returns the state without the faults that an input before has shown."""
+    """Returns the state without the faults of the previous input."""
     state = replace(state, jumped="", leap="", mixed="")
     if not state.estimates.fault:
         return state
@@ -100,7 +102,7 @@ def _find_refusal(config: GateConfig, event: inputs.Input) -> str:
 def _take_command(
     state: GateState, command: inputs.Command, arrival_s: float
 ) -> GateState:
-    """Takes a command once its scan has arrived; until then the previous one stays in force."""
+    """Takes a command once its scan has arrived; until then the previous one stays in effect."""
     scans = state.scans
     if command.stamp_ns not in scans.stamps_ns:
         since = arrival_s if state.pending_s is None else state.pending_s
@@ -157,7 +159,7 @@ def _take_odometry(
         return _refuse_stamp(replace(state, odometries=arrivals), ODOM, fault)
     leap = _find_leap(config, state, odometry, now)
     if leap:
-        # Later poses are judged relative to this one, and earlier ones say nothing any more.
+        # Later poses are judged relative to this one; earlier ones no longer matter.
         state = replace(
             state,
             odometry=odometry,
@@ -204,13 +206,13 @@ def _refuse_stamp(state: GateState, topic: str, fault: str) -> Taken:
 def _find_leap(
     config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float
 ) -> str:
-    """Returns what is wrong with a pose that the robot can't have driven to; else empty."""
+    """Returns the fault of a pose that the robot can't have reached, or ""."""
     before = state.odometry
     bounds = config.limits
     if before is None or bounds is None:
         return ""
     stamped = (odometry.stamp_ns - before.stamp_ns) * S_PER_NS
-    passed = max(stamped, now - state.odometries.times[-1])  # either of them may jitter
+    passed = max(stamped, now - state.odometries.times[-1])  # either time may jitter
     path_noise, turn_noise = (frozen.NOISE * std * passed for std in config.odom_std)
     speed, turn_rate = limits.get_maximum_speeds(bounds)
     max_speed = EXCESS_FACTOR * speed + EXCESS_SPEED
@@ -227,7 +229,7 @@ def _find_leap(
 
 
 def scan_malformed(config: GateConfig, scan: inputs.Scan) -> str:
-    """The scan is from another lidar than the declared one, or every range is NaN."""
+    """The scan is not from the declared lidar, or every range is NaN."""
     angles = config.beam_angles
     first, step = scan.angles
     if scan.ranges.shape != angles.shape:
@@ -242,7 +244,7 @@ def scan_malformed(config: GateConfig, scan: inputs.Scan) -> str:
 
 
 def check_reading(config: GateConfig, reading: inputs.SensorReading) -> str:
-    """The reading is of an unknown sensor, or not finite."""
+    """The reading is from an unknown sensor, or not finite."""
     if reading.name not in config.sensors:
         return "there is no such sensor"
     if not np.isfinite(reading.points).all():
@@ -293,4 +295,4 @@ REFUSALS: tuple[tuple[type, Callable[[GateConfig, Any], str]], ...] = (
     (inputs.Command, check_finite),
     (inputs.Command, check_plausible),
 )
-"""By the type of the input, in order: what is wrong with it; empty if nothing is."""
+"""Checks by type of input, in order; each returns the fault of an input, or ""."""

@@ -13,17 +13,17 @@ from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec
 
-# a command beyond this multiple of its limit is a fault, and refused
+# a command beyond this multiple of its limit is rejected as a fault
 IMPLAUSIBLE = 10.0
-# motions closer in time are not published, because their derivatives would be noise [s]
+# minimum time between published motions; shorter ones give noisy derivatives [s]
 MIN_STEP_S = 1e-3
-PERIOD_S = 0.02  # of the gate's ticks [s]; a limit that allows the whole range within one is a typo
+PERIOD_S = 0.02  # of the gate's ticks [s]; a limit that allows the full range within one is a typo
 SNAP = 1e-12  # a value this close to its target, as a fraction of the maximum, has reached it
 HUGE = 1e300  # numbers are clipped to this before a multiplication: inf times 0 would be NaN
 STILL = 1e-9
-# numbers nearer to zero are denormal and lose digits
+# numbers closer to zero are denormal and lose digits
 SMALLEST_NORMAL = float(np.finfo(np.float64).tiny)
-# if no speed may exceed this, the robot can't be driven [m/s or rad/s]
+# if all speed limits are below this, the robot can't be driven [m/s or rad/s]
 MIN_MOTION = 0.01
 # Within this time [s] a command must be able to reach this fraction of its maximum.
 LONGEST_START_S = 10.0
@@ -37,8 +37,8 @@ CAR_TURN = 4.0
 class CommandLimit(Schema):
     """Limits of one command, in its unit; an angle's rate is the steering rate."""
 
-    min: float = Field(le=0.0)  # minimum that the gate lets pass
-    max: float = Field(ge=0.0)  # maximum that the gate lets pass
+    min: float = Field(le=0.0)  # minimum that passes the gate
+    max: float = Field(ge=0.0)  # maximum that passes the gate
     rate: float = Field(gt=0.0)  # maximum change per second, in both directions
     jerk: float = Field(gt=0.0)  # maximum change of the rate per second
 
@@ -52,18 +52,18 @@ class CommandLimit(Schema):
 class Stopping(Schema):
     """Stopping behaviour, for the shield: distance = v latency + v^2 / (2 deceleration)."""
 
-    # from a command until the robot follows it, with lags [s]
+    # time from a command until the robot follows it, including lags [s]
     latency: float = Field(ge=0.0)
-    # of the braking that follows [m/s^2]
+    # deceleration of the following braking [m/s^2]
     deceleration: float = Field(gt=0.0)
     # clearance kept around the footprint [m]
     margin: float = Field(default=0.05, ge=0.0)
-    # of obstacles that approach [m/s]; 0 if all stand still
+    # speed of approaching obstacles [m/s]; 0 if all are static
     obstacle_speed: float = Field(default=1.0, ge=0.0)
 
 
 class LimitsFile(Schema):
-    """A file of limits. Only `shield` may be left out; it is then derived from the model."""
+    """A file of limits. Only `shield` is optional; by default it is derived from the model."""
 
     robot: str  # name of the robot it is for
     commands: dict[str, CommandLimit]  # by the name of the command in the RobotSpec
@@ -83,7 +83,7 @@ class Limits:
 
 
 def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
-    """Reads limits, shipped or of a YAML file; ConfigError names the key that can't be used."""
+    """Reads limits, shipped or from a YAML file. ConfigError names the faulty key."""
     path = find_config(name, "limits")
     file = load_yaml(path, LimitsFile)
     if file.robot != robot.name:
@@ -186,7 +186,7 @@ def is_within(value: Array, limits: Limits) -> bool:
 
 
 def flush_denormals(values: Array) -> Array:
-    """Returns values (...) with denormal ones, which are no speeds, replaced by zero."""
+    """Returns values (...) with denormal ones replaced by zero."""
     return np.where(np.abs(values) < SMALLEST_NORMAL, 0.0, values)
 
 
@@ -213,8 +213,9 @@ def follow(
     limits: Limits,
     waits: bool = True,
 ) -> tuple[Array, Array]:
-    """Moves a command (C,) and its slope towards its target as fast as rate and jerk allow."""
-    # The turn waits for the speed, so that an accelerating robot is on its path from the start.
+    """Moves a command (C,) and its slope to its target as fast as rate and jerk limits allow."""
+    # The turn follows the progress of the speed, so that an accelerating robot stays on
+    # its path.
     wanted = target.copy()
     after = value.copy()
     change = slope.copy()
@@ -248,10 +249,10 @@ def _follow_one(
     rate: float,
     jerk: float,
 ) -> tuple[float, float]:
-    # A slope a can be brought back to zero within a change of a^2 / (2 jerk), whatever the coming
-    # intervals, because the sum over them lies below the integral. So a value that far within its
-    # bounds stays within them. Values are fractions of the maximum and slopes are steps of this
-    # interval, so that nothing overflows.
+    # A slope a can be reduced to zero within a change of a^2 / (2 jerk) for any future
+    # intervals, because the sum over them is below the integral. A value with this
+    # margin therefore stays within its bounds. Values are fractions of the maximum and
+    # slopes are steps per interval, so that nothing overflows.
     scale = max(-min_value, max_value)
     low = min_value / scale
     high = max_value / scale
@@ -283,5 +284,5 @@ def _step_towards(gap: float, jerk: float) -> float:
     reach = 2.0 * jerk * abs(gap)
     if reach == 0.0:
         return 0.0
-    # Not as root minus jerk, which cancels to rounding error for small gaps.
+    # Not as root minus jerk, which suffers from cancellation for small gaps.
     return math.copysign(reach / (math.sqrt(jerk * jerk + reach) + jerk), gap)

@@ -3,14 +3,14 @@
 `watch_scan` judges each new scan while the robot is commanded to move:
 
 1. Reduce it to the median ranges in a few directions.
-2. Choose an earlier scan as the reference: the oldest since which the robot has not turned far. If
-   odometry shows too little motion since then, or nearly all of it in one half of the time, nothing
-   is decided.
+2. Choose an earlier scan as the reference: the oldest one since which the robot has not
+   turned far. If odometry shows too little motion since then, or nearly all of it in
+   one half of the time, there is no decision.
 3. Predict the new scan from the reference and that motion.
-4. Compare it sector by sector, wherever the prediction differs clearly from the reference. The
-   share of a sector is the part of the predicted change that the new scan shows: 1 if odometry is
-   right, 0 if the body stands. A scene that looks the same after the motion, such as a long
-   corridor, decides nothing.
+4. Compare it sector by sector, wherever the prediction differs clearly from the
+   reference. The share of a sector is the fraction of the predicted change that the new
+   scan shows: 1 if odometry is right, 0 if the body does not move. A scene that looks
+   the same after the motion, such as a long corridor, allows no decision.
 5. The scans contradict odometry if most sectors show a small share, their median hardly any, and in
    the median sector few ranges changed visibly.
 6. Report a held body (rule `body_held`) once scans have contradicted odometry for some time.
@@ -47,11 +47,12 @@ MEDIAN_FACTOR = 1.25
 
 @dataclass(frozen=True)
 class Settings:
-    """When scans contradict odometry.
+    """Settings that define when scans contradict odometry.
 
-    Usual shares: 0.77 for a skid-steer robot whose odometry turns 30 % too far, 0.5 on ice. Tyres
-    that break loose may show a share of 0.1 in a turn of half a second; such a robot is not held,
-    because it also drives and so its ranges change.
+    Usual shares: 0.77 for a skid-steer robot whose odometry turns 30 % too far, 0.5 on
+        ice. Tyres that lose grip may show a share of 0.1 in a turn of half a second;
+        such a robot does not count as held, because it also drives and its ranges
+        change.
 
     Attributes:
         spacing: angle between the directions of a reduced scan [rad].
@@ -60,8 +61,8 @@ class Settings:
         longest_s: time for which scans are kept as references, and the longest over which odometry
             is extrapolated to a scan's stamp [s].
         slow_periods: periods of a slow lidar that should fit into that time.
-        slow_factor: maximum factor by which the time is prolonged for them.
-        min_periods: periods that must fit, whatever the factor.
+        slow_factor: maximum factor by which the time is extended for them.
+        min_periods: periods that must fit, regardless of the factor.
         kept_every_s: minimum time between scans that are kept [s].
         min_path: minimum path by odometry since the reference [m], unless the turn suffices.
         min_turn: minimum turn by odometry since the reference [rad], unless the path suffices.
@@ -122,7 +123,7 @@ SETTINGS = Settings()
 
 
 class Verdict(NamedTuple):
-    """What two scans say about the motion in between.
+    """What two scans show about the motion between them.
 
     Attributes:
         share: median fraction of the motion that they show; NaN if nothing is decided.
@@ -155,8 +156,9 @@ def watch_scan(config: GateConfig, state: GateState, scan: Scan) -> ScanMotion:
     verdict = UNDECIDED
     held_since_ns = None
     push_s = None
-    # Only a robot that is commanded to move can be held. Each push (motion commanded without a
-    # pause) is judged alone: tyres that slip at each start say nothing about the time in between.
+    # Only a robot that is commanded to move can be held. Each push (motion commanded
+    # without a pause) is judged separately: tyres that slip at each start do not matter
+    # for the time in between.
     if state.push is not None:
         push_s = state.push.since_s
         verdict = judge_motion(config, kept, newest)
@@ -192,7 +194,7 @@ def _can_judge(config: GateConfig) -> bool:
 
 
 def _compute_memory_s(config: GateConfig) -> float:
-    """Returns for how long scans are kept [s], which is longer for a slow lidar."""
+    """Returns how long scans are kept [s], which is longer for a slow lidar."""
     slow_s = min(
         SETTINGS.slow_periods / config.scan_rate,
         SETTINGS.slow_factor * SETTINGS.longest_s,
@@ -279,10 +281,11 @@ def _select_reference(
 ) -> tuple[ReducedScan | None, float]:
     """Returns the scan to compare the newest one with; None if odometry shows too little motion.
 
-    Returns also the fraction of the motion since then in that half of the time with less of it.
+    Also returns the fraction of the motion in the half of the time with less motion.
     """
-    # The oldest scan since which the robot has not turned further than usual; without one, the
-    # youngest that is of any use. The last one is left out: a scan has to lie in between.
+    # The oldest scan since which the robot has not turned further than usual; otherwise
+    # the youngest usable one. The last scan is excluded, because another scan has to be
+    # in between.
     chosen = None
     for index, scan in enumerate(kept[:-1]):
         turn = abs(_measure_turn(scan, newest))
@@ -366,7 +369,7 @@ def compute_noise(config: GateConfig, directions: Directions) -> Noise:
 
 
 def warm_up(config: GateConfig) -> None:
-    """Compiles the kernels for a scan; a moving robot does not have the seconds it takes."""
+    """Compiles the kernels for a scan, which takes seconds that a moving robot does not have."""
     if not _can_judge(config):
         return
     ranges = np.ones(len(config.beam_angles), np.float32)

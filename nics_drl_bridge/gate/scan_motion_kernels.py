@@ -1,4 +1,4 @@
-"""Compiled: reduces scans, predicts how a motion changes them, and compares that with what changed.
+"""Compiled: reduces scans, predicts their change by a motion, and compares it with theirs.
 
 A reduced scan has one range (K,) for each of a few evenly spaced directions, NaN where few beams
 return. `scan_motion` calls these kernels in order:
@@ -18,7 +18,8 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.kernels import kernel
 
 Ranges = NDArray[np.float32]
-# Maximum number of beams in a window. A denser lidar's medians are those of the middle ones.
+# Maximum number of beams in a window. For a denser lidar, only the middle ones are
+# used.
 LARGEST_WINDOW = 129
 
 
@@ -30,7 +31,7 @@ class Directions(NamedTuple):
         first: angle of the first one [rad].
         step: angle between neighbours, greater than 0 [rad].
         beams_per_direction: beams of the lidar for each direction.
-        half_window: beams on each side of the middle one whose median is taken.
+        half_window: beams on each side of the middle one that enter the median.
         full_circle: the last direction is a neighbour of the first.
     """
 
@@ -50,12 +51,12 @@ class Noise(NamedTuple):
 
 
 class Thresholds(NamedTuple):
-    """Changes of a range that count: the larger of a length and a number of deviations.
+    """Minimum changes of a range: the larger of a length and a number of deviations.
 
     Attributes:
         predicted: change that the motion must cause in a sector that is compared [m].
         predicted_deviations: the same in standard deviations.
-        visible: observed change that is more than noise [m].
+        visible: observed change that exceeds noise [m].
         visible_deviations: the same in standard deviations.
     """
 
@@ -102,16 +103,18 @@ def reduce_scan(ranges: Ranges, directions: Directions, out: Ranges) -> None:
 def predict_scan(
     ranges: Ranges, directions: Directions, moved: Array, gap: float, out: Ranges
 ) -> None:
-    """Writes the ranges (K,) that a lidar sees after a motion, from the surfaces it saw before.
+    """Writes the ranges (K,) of a lidar after a motion, from the surfaces it saw before.
 
-    Neighbouring ends a and b of the old scan are one surface, a straight line, unless there is a
-    gap between them. It is moved into the new frame, and cut with all directions that it covers.
+    Neighbouring end points a and b of the old scan form one straight surface, unless
+    there is a gap between them. The surface is moved into the new frame, and
+    intersected with all directions that it covers.
 
     Args:
         ranges: (K,) of the old scan [m].
         directions: of both scans.
         moved: (3,) motion of the lidar in its old frame: x, y [m], heading [rad].
-        gap: fraction of the shorter range by which the ranges of one surface differ at most.
+        gap: maximum difference of neighbouring ranges on one surface, as a fraction of
+            the shorter one.
         out: (K,) ranges to the nearest surface [m]; NaN in directions that none covers.
     """
     count = ranges.shape[0]
@@ -139,7 +142,7 @@ def predict_scan(
         dot = ax * bx + ay * by
         if cross <= 0.0 or dot <= 0.0:
             continue  # seen from behind, or around the lidar itself
-        # The directions that it covers, as fractions of the spacing from the first one.
+        # The directions that the surface covers, in spacings from the first one.
         begin = (math.atan2(ay, ax) - directions.first) / directions.step
         end = begin + math.atan2(cross, dot) / directions.step
         shift = circle * math.floor(begin / circle)

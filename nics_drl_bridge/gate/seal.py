@@ -1,4 +1,4 @@
-"""The last line of a black box, which holds the checksum of all lines before."""
+"""The last line of a black box, with the checksum of all previous lines."""
 
 import hashlib
 from collections.abc import Iterable, Iterator
@@ -7,7 +7,7 @@ SEAL = b'{"sha256": "%b"}\n'
 
 
 def append_checksum(lines: Iterable[bytes]) -> Iterator[bytes]:
-    """Yields lines, and then the line with their checksum: memory must not grow at a stop."""
+    """Yields lines, then a line with their checksum, without keeping them in memory."""
     digest = hashlib.sha256()
     for line in lines:
         digest.update(line)

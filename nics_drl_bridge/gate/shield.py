@@ -3,19 +3,19 @@
 `shield` decides on each command, after limits of value, rate and jerk:
 
 1. A command from which the robot can stop passes.
-2. Any other is reduced until the robot can stop (dynamic window of Fox, Burgard and Thrun, 1997):
-   only its speed, or speed and turn alike, or its turn is left out.
+2. Any other is reduced until the robot can stop (dynamic window of Fox, Burgard and
+   Thrun, 1997): its speed, its speed and turn in proportion, or its turn is removed.
 
-Whether it can stop is found by sweeping its footprint along arcs until it rests, twice:
+To check whether it can stop, its footprint is swept along arcs until rest, twice:
 
-- in a calm stop, at half the deceleration, as if all obstacles stood still: so that an approach
-  ends smoothly;
+- in a calm stop, at half the deceleration, with all obstacles static, so that an
+  approach ends smoothly;
 - in a sudden stop, as hard as it can brake, before obstacles that may approach. The robot keeps
   its twist for the age of the scan, the wait for the next decision and its own reaction. That
   twist is anything between its odometry, the new command, the last one and those before it that the
   scan does not show yet.
 
-What an obstacle is, see `evidence`.
+See `evidence` for what counts as an obstacle.
 """
 
 from collections.abc import Callable
@@ -41,13 +41,13 @@ from nics_drl_bridge.gate.stops import compute_age
 from nics_drl_bridge.interface import Array
 
 TimedCommand = tuple[float, Array]  # time of its publication [s], and its values (C,)
-BISECTIONS = 6  # of the scale by which a motion is reduced
-# While it turns, a robot drives at least this fast [m/s] towards an obstacle, or not at all:
-# creeping on, it would lose the room that it needs to turn.
+BISECTIONS = 6  # number of bisections of the scale by which a motion is reduced
+# A turning robot approaches an obstacle at least this fast [m/s] or not at all: by
+# creeping on, it would lose the space that it needs to turn.
 CREEP_SPEED = 0.1
 STEP = 0.02  # distance between two places at which the footprint is checked [m]
 CALM_BRAKING = 0.5  # fraction of the deceleration that a calm stop needs
-# If a stop may end below this fraction of its bound, the shorter stop is swept, too.
+# If a stop may end below this fraction of its bound, the shorter stop is swept as well.
 SHORT_STOP = 0.9
 # Grid of twists that are swept: speeds along each axis, turn rates, and curvatures of a car.
 SPEED_COUNT = 3
@@ -70,19 +70,20 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
 
     A motion from which the robot can stop passes as it is. Otherwise:
 
-    - If the turn without any speed is safe, the turn rate stays and only the speed is reduced: an
-      obstacle ahead must not keep the robot from turning away.
-    - If it is not, speed and turn rate are scaled alike, which keeps the robot on its path. If that
-      leaves a creep, but straight on the robot could stop from `CREEP_SPEED`, the turn is left out
-      instead: an obstacle at its side must not keep the robot from leaving straight.
+    - If the turn on the spot is safe, the turn rate is kept and only the speed is
+      reduced: an obstacle ahead must not prevent the robot from turning away. -
+      Otherwise, speed and turn rate are scaled by the same factor, which keeps the
+      robot on its path. If only a creep remains, but the robot could stop from
+      `CREEP_SPEED` straight ahead, the turn is removed instead: an obstacle at its side
+      must not prevent the robot from leaving straight ahead.
 
-    A creep is a speed below `CREEP_SPEED` with a turn, of a robot that can turn on the spot. It
-    would end so near to an obstacle that the robot could not turn any more. So a commanded creep
-    passes at once only where the robot could also stop from `CREEP_SPEED`, and it becomes zero
-    where the turn alone is safe.
+    A creep is a speed below `CREEP_SPEED` with a turn, of a robot that can turn on the
+    spot. It would end so close to an obstacle that the robot could no longer turn. A
+    commanded creep therefore passes unchanged only if the robot could also stop from
+    `CREEP_SPEED`; if only the turn is safe, the speed becomes zero.
     """
     limiter = config.shield
-    # Without a scan, the gate stops before it comes here.
+    # Without a scan, the gate has already stopped.
     if limiter is None or config.limits is None or state.obstacles is None:
         return motion
     is_speed = config.limits.linear
@@ -147,10 +148,10 @@ def _find_maximum_scale(can_stop: Callable[[float], bool]) -> float:
 def _can_stop_calmly(
     config: GateConfig, shield: ShieldConfig, value: Array, obstacles: Array
 ) -> bool:
-    """True if the robot can stop from a command (C,) after the next scan, before what stands."""
+    """True if a robot with a command (C,) can stop before static obstacles after the next scan."""
     twists = _span_twists(config, shield, value[None], None)
-    # The robot follows the command after a latency. The next scan comes after a period and is
-    # decided on after `hold_s`. The robot follows the stop after another latency.
+    # The command takes effect after a latency. The next scan arrives after a period, and
+    # the stop is decided after `hold_s` and takes effect after another latency.
     reaction_s = (
         1.0 / config.scan_rate + (shield.hold_s + shield.latency_s) + shield.latency_s
     )
@@ -166,10 +167,10 @@ def _can_stop_suddenly(
     obstacles: Array,
     now: float,
 ) -> bool:
-    """True if the robot can stop, whatever it does already, before what may approach."""
+    """True if the robot can stop before moving obstacles, whatever its current motion."""
     arrivals = [state.scans, *(sensor.arrivals for sensor in state.sensors)]
     data_age_s = max(0.0, *(compute_age(topic, now) for topic in arrivals))
-    # Those in force since the oldest data, or within a reaction before.
+    # Commands in effect since the oldest data, or within a reaction time before.
     since_s = now - data_age_s - _get_longest_reaction(shield)
     unshown = [command for _, command in _select_in_force(state.recent, since_s, now)]
     commands = np.array([*unshown, state.value, value])
@@ -209,9 +210,9 @@ def _get_longest_reaction(shield: ShieldConfig) -> float:
 def _select_in_force(
     commands: tuple[TimedCommand, ...], since_s: float, now: float
 ) -> tuple[TimedCommand, ...]:
-    """Returns those of the commands, oldest first, that were in force at `since_s` or later.
+    """Returns the commands, oldest first, that were in effect at `since_s` or later.
 
-    A command is in force until the next one.
+    A command is in effect until the next one.
     """
     ends_s = [*(time for time, _ in commands[1:]), now]
     return tuple(
@@ -224,7 +225,7 @@ def _select_in_force(
 def list_stops(
     shield: ShieldConfig, reaction_s: float, braking: float, latencies: float
 ) -> list[Stop]:
-    """Returns the stops to sweep. If the turn brakes by itself, either may end early.
+    """Returns the stops to sweep. If the turn brakes independently, either may end early.
 
     Args:
         shield: the stopping behaviour.
@@ -278,7 +279,7 @@ def _span_twists(
 
 
 def _add_drift(shield: ShieldConfig, twists: Array) -> Array:
-    """Returns twists (n, 3), and those between which a robot drifts off its arc while it brakes."""
+    """Returns twists (n, 3), and twists that bound the drift off its arc while it brakes."""
     drift = shield.drift
     if drift.is_none:
         return twists
@@ -314,7 +315,7 @@ def _span_car_twists(
 
 
 def warm_up() -> None:
-    """Compiles the kernels of the shield; a moving robot does not have the seconds it takes."""
+    """Compiles the shield's kernels, which takes seconds that a moving robot does not have."""
     shield_kernels.fill_grid(np.zeros(3), np.zeros(3), np.ones(3, np.int64))
     body = get_body(
         ShieldConfig(0.0, 1.0, 0.0, 0.0, footprint_radius=1.0, obstacle_speed=0.0)

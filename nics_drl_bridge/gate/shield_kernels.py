@@ -1,16 +1,17 @@
-"""Compiled: sweeps a footprint along the arcs of a robot that stops, and looks for contacts.
+"""Compiled: sweeps the footprint of a stopping robot along its arcs and checks for contacts.
 
-The robot keeps a twist for a reaction time and then brakes evenly. It stays on one arc, unless its
-turn brakes by itself, see `_fill_places_of_separate_turn`. With a
-speed v and a deceleration a it gets as far as in the time T = reaction + v / (2 a) at full speed.
-`is_free` checks such a stop in four steps:
+The robot keeps a twist for a reaction time and then brakes uniformly. It stays on one
+arc, unless its turn brakes separately, see `_fill_places_of_separate_turn`. With speed
+v and deceleration a it covers the same path as in the time T = reaction + v / (2 a) at
+full speed. `is_free` checks such a stop in four steps:
 
-1. Bound the path of every point of the footprint: (speed + speed by the turn) * T.
+1. Bound the path of every point of the footprint: (speed + speed due to the turn) * T.
 2. Select the obstacles that may come near within this path.
-3. Place the footprint along the arc, so densely that no point of it moves further than one step.
-4. At each place, compare the clearance of each obstacle with the one that is required: the margin,
-   or what it has now if that is less, and the distance by which it may have approached by then.
-   Places that an obstacle can't reach are skipped.
+3. Place the footprint along the arc, so densely that no point of it moves further than
+   one step.
+4. At each place, compare the clearance of each obstacle with the required one: the
+   margin (or the current clearance if that is less) plus the distance by which the
+   obstacle may have approached. Places that an obstacle can't reach are skipped.
 
 Shared arguments:
     twist (3,): of the robot before it stops: vx, vy [m/s], turn rate [rad/s].
@@ -30,8 +31,8 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim.collision_kernels import Outline, outline_point
 
-# Columns of obstacles, in the robot's frame: position [m], greatest speed of approach [m/s]; and of
-# those that are near: also the clearance that is required, and the present one [m].
+# Columns of obstacles, in the robot's frame: position [m], maximum speed of approach
+# [m/s]; for near obstacles also the required and the current clearance [m].
 X = 0
 Y = 1
 APPROACH = 2
@@ -42,7 +43,9 @@ COSINE = 2
 SINE = 3
 TIME = 4
 ROUNDING = 1e-9  # tolerance of the required clearance [m]
-TIME_BISECTIONS = 24  # that find when a braking robot has moved by a path
+TIME_BISECTIONS = (
+    24  # bisections for the time at which a braking robot has covered a path
+)
 SMALL_TURN = 1e-6  # turn below which an arc is computed by its series [rad]
 
 
@@ -52,13 +55,14 @@ class Body(NamedTuple):
     Attributes:
         outline: of the footprint, in the robot's frame; without corners for a circle.
         radius: of the circle around the footprint [m].
-        farthest_corner: its distance from the robot's origin, by which a turn moves it [m]; 0 for a
+        farthest_corner: distance of that corner from the robot's origin [m]; 0 for a
             circle, which a turn does not move.
         margin: clearance [m].
         lever: factor of the turn rate in the speed that is braked [m].
         order: of the norm of vx and vy that is braked; see `robot.braking.Braking`.
-        turn_delay: time by which the braking of a turn begins later than that of the speed [s].
-        turn_deceleration: of a turn that brakes apart from the speed [rad/s^2]; 0 if it does not.
+        turn_delay: time by which a turn begins to brake later than the speed [s].
+        turn_deceleration: of a turn that brakes independently of the speed [rad/s^2]; 0
+            if it does not.
     """
 
     outline: Outline
@@ -80,7 +84,7 @@ def is_free(
     deceleration: float,
     step: float,
 ) -> bool:
-    """True if no obstacle comes within the margin of a robot that stops from any of its twists.
+    """True if a robot keeps its margin from all obstacles while it stops from any of the twists.
 
     An obstacle that is already within the margin must not come nearer.
 
@@ -90,7 +94,7 @@ def is_free(
         body: the footprint, and its margin.
         reaction: time until the speed is braked [s].
         deceleration: of the speed [m/s^2].
-        step: greatest path of the footprint between two places [m].
+        step: maximum path of the footprint between two places [m].
     """
     longest_path = 0.0
     longest_time = 0.0
@@ -157,7 +161,8 @@ def _bound_path(
 ) -> tuple[float, float]:
     """Returns the longest path of a point of the footprint [m], and the speed that brakes [m/s].
 
-    A turn brakes like the speed of the part that it moves most, unless it brakes by itself.
+    A turn brakes like the speed of the point that it moves most, unless it brakes
+    independently.
     """
     speed = math.hypot(twist[0], twist[1])
     turn_speed = abs(twist[2]) * body.farthest_corner
@@ -263,10 +268,11 @@ def _fill_places_of_separate_turn(
     reaction: float,
     deceleration: float,
 ) -> float:
-    """Fills places as `_fill_places` if the turn brakes by itself; returns the longest step [s].
+    """Fills places for a turn that brakes independently; returns the longest step [s].
 
-    The footprint moves by the same path, at most, from each place to the next. Such a robot leaves
-    its arc, so each place is reached from the one before by an arc of its own.
+    The path of the footprint from each place to the next is limited as in
+    `_fill_places`. Such a robot leaves its arc, so each place is reached from the
+    previous one by a separate arc.
     """
     speed = math.hypot(twist[0], twist[1])
     turn_rate = abs(twist[2])
@@ -327,7 +333,7 @@ def _fill_places_of_separate_turn(
 def _compute_braking_time(
     full_speed_time: float, speed: float, reaction: float, deceleration: float
 ) -> float:
-    """Returns when a braking robot has got as far as in a time at full speed [s]."""
+    """Returns the time in which a braking robot gets as far as in a time at full speed [s]."""
     if full_speed_time <= reaction:
         return full_speed_time
     square = speed * speed - 2.0 * deceleration * speed * (full_speed_time - reaction)
@@ -367,7 +373,7 @@ def follow_arc(twist: Array, time: float) -> tuple[float, float, float, float]:
 
 @kernel(allocates=True)
 def fill_grid(low: Array, high: Array, counts: NDArray[np.int64]) -> Array:
-    """Returns a grid of twists (K, 3) between two (3,), with so many along each axis."""
+    """Returns a grid of twists (K, 3) between two (3,), with `counts` along each axis."""
     twists = np.empty((counts[0] * counts[1] * counts[2], 3))
     for k in range(twists.shape[0]):
         remainder = k

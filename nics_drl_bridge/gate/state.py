@@ -36,8 +36,8 @@ def replace(record: Record, **changes: Any) -> Record:
 class ShieldConfig:
     """Stopping behaviour of the robot, and the clearance it keeps."""
 
-    latency_s: float  # from a command until the robot follows it, lags included
-    deceleration: float  # of the braking that follows [m/s^2]
+    latency_s: float  # time from a command until the robot follows it, including lags
+    deceleration: float  # deceleration of the braking [m/s^2]
     margin: float  # clearance kept around the footprint [m]
     hold_s: float  # longest time until the next decision
     footprint_radius: float  # of the circle around the robot [m]
@@ -53,10 +53,12 @@ class ShieldConfig:
     unknown_width: float = 0.35  # angle over which that fraction is taken [rad]
     # Corners of the footprint in `base_link`, in order [m]; none of a robot that is a circle.
     outline: tuple[tuple[float, float], ...] = ()
-    lever: float = 0.0  # by which a turn rate adds to the speed that is braked [m]
-    order: float = 2.0  # of the norm of ahead and sideways, see `Braking.order`
-    drift: Drift = NO_DRIFT  # off its arc while it brakes; of no account for a car
-    turn: TurnBraking | None = None  # of a robot whose turn brakes apart from its speed
+    lever: float = 0.0  # factor by which a turn rate adds to the speed to brake [m]
+    order: float = 2.0  # of the norm of forward and sideways speed, see `Braking.order`
+    drift: Drift = NO_DRIFT  # deviation from its arc while it brakes; unused for a car
+    turn: TurnBraking | None = (
+        None  # of a robot whose turn brakes independently of its speed
+    )
 
 
 @dataclass(frozen=True)
@@ -66,40 +68,42 @@ class GateConfig:
     # (C,) index of each command in linear.x, linear.y, angular.z. For a car that takes turn rates,
     # angular.z is the turn rate of a `bicycle` at its steering angle.
     fields: tuple[int, ...]
-    limits: Limits | None  # of the commands; None lets nothing pass
+    limits: Limits | None  # of the commands; None: no command passes
     beam_angles: Array  # (B,) of the lidar [rad]
     # of the lidar in `base_link`: x [m], y [m], heading [rad]
     mount: tuple[float, float, float]
     range_min: float  # of the lidar [m]
     scan_rate: float  # declared [Hz]
     odom_rate: float  # declared [Hz]
-    # False: it is the minimum that a model needs, and a higher rate is fine
+    # False: it is the minimum that the model needs, and may be exceeded
     odom_rate_declared: bool = True
     range_max: float = 0.0  # of the lidar [m]; 0 if unknown
-    # greatest age of the newest scan, and of the scan behind a command
+    # maximum age of the newest scan, and of the scan behind a command
     scan_age_s: float = 0.30
-    odom_age_s: float = 0.30  # greatest age of the newest odometry
-    command_age_s: float = 0.30  # greatest age of the newest command
+    odom_age_s: float = 0.30  # maximum age of the newest odometry
+    command_age_s: float = 0.30  # maximum age of the newest command
     race_s: float = 0.05  # time by which a command may overtake its scan
-    # for which data must be fresh and the robot at rest before arming
+    # time for which data must be fresh and the robot at rest before arming
     settle_s: float = 1.0
     rate_tolerance: float = 0.3  # relative deviation of a rate from the declared one
     # A stamp this far back, or before arming this far ahead, is a jump; if armed, see `AHEAD_S`.
     clock_jump_s: float = 0.5
-    # of the stamps [s/s]; not 1 only in a simulation out of real time
+    # rate of the stamps [s/s]; differs from 1 only in a simulation that is not in real
+    # time
     clock_rate: float = 1.0
-    # stamps are those of a simulator, which may fall behind real time
+    # stamps come from a simulator, which may fall behind real time
     simulated: bool = False
     # longest time between two ticks, and length of the stop after a longer one
     gap_s: float = 0.2
-    e_stop_required: bool = True  # one that was never heard counts as pressed
-    e_stop_silence_s: float = 0.25  # after which one that was heard counts as pressed
+    e_stop_required: bool = True  # an e-stop that was never heard counts as pressed
+    e_stop_silence_s: float = 0.25  # silence after which the e-stop counts as pressed
     estimate_required: bool = True  # arming needs an estimator that has converged
-    # Greatest standard deviation that the estimate may gain within some seconds, see `estimate`.
+    # Maximum standard deviation that the estimate may gain within some seconds, see
+    # `estimate`.
     estimate_position: float = 0.5  # [m]
     estimate_heading: float = 0.3  # [rad]
-    estimate_silence_s: float = 0.5  # greatest age of the estimate for that
-    # path over which identical scans are frozen [m, or rad turned]
+    estimate_silence_s: float = 0.5  # maximum age of the estimate for this check
+    # path or turn over which identical scans count as frozen [m or rad]
     frozen_distance: float = 0.2
     stuck_s: float = 1.0  # time without motion while commanded that causes a stop
     # stop when scans show none of the motion that odometry shows
@@ -108,7 +112,7 @@ class GateConfig:
     # standard deviation, in metres and as a fraction of the range
     range_noise: tuple[float, float] = NO_NOISE
     shield: ShieldConfig | None = None
-    sensors: tuple[str, ...] = ()  # further ones, which must be as fresh as the scan
+    sensors: tuple[str, ...] = ()  # additional ones, which must be as fresh as the scan
     bicycle: Bicycle | None = None
 
     def command(self, twist: Array) -> Array:
@@ -130,9 +134,9 @@ class Cause:
     """Cause of a stop."""
 
     rule: str
-    topic: str  # concerned; empty for the gate itself
+    topic: str  # topic of the cause; empty for the gate itself
     detail: str
-    age_s: float = float("nan")  # of data that are too old, otherwise NaN
+    age_s: float = float("nan")  # age of data that are too old, otherwise NaN
     limit_s: float = float("nan")
 
     @property
@@ -147,7 +151,7 @@ class Cause:
 
 
 Mark = tuple[float, int, int, float]
-"""Arrival [s], stamp [ns] and number of a datum, and the greatest lead until the next mark [s]."""
+"""Arrival [s], stamp [ns] and number of a datum, and the maximum lead until the next mark [s]."""
 
 
 @dataclass(frozen=True)
@@ -156,20 +160,20 @@ class Arrivals:
 
     stamps_ns: tuple[int, ...] = ()  # of the latest headers
     times: tuple[float, ...] = ()  # their arrivals on the steady clock [s]
-    late: tuple[float, ...] = ()  # their delays beyond the least possible one [s]
+    late: tuple[float, ...] = ()  # their delays beyond the minimum possible one [s]
     origin: tuple[int, float] = (0, 0.0)  # stamp [ns] and arrival [s] of the first
-    count: int = 0  # data since the first
+    count: int = 0  # number of data since the first
     envelope: float = 0.0  # lead of the fastest data [s]
-    unbroken_s: float = INF  # time since which no gap was too long
-    marks: tuple[Mark, ...] = ()  # taken at intervals, as far back as arming needs
+    unbroken_s: float = INF  # start of the time without a gap that is too long
+    marks: tuple[Mark, ...] = ()  # taken at intervals, as far back as arming requires
 
 
 @dataclass(frozen=True)
 class Sameness:
-    """A picture that the lidar has shown, and where the robot first saw it."""
+    """A scan that the lidar has repeated, and where the robot first saw it."""
 
     ranges: Ranges  # (B,) of the first scan that showed it [m]
-    count: int  # scans that showed it
+    count: int  # number of scans that showed it
     # (3,) odometry pose at the first; None if there was no odometry yet
     first: Array | None
 
@@ -185,7 +189,7 @@ class View:
 
 @dataclass(frozen=True)
 class EstimateMark:
-    """An earlier estimate, from which uncertainty is counted."""
+    """An earlier estimate, relative to which uncertainty is measured."""
 
     time_s: float  # of its arrival
     pose: Array  # (3,) in `map`
@@ -198,7 +202,7 @@ class EstimateTrack:
 
     # recent ones, oldest first; the first is the origin
     marks: tuple[EstimateMark, ...] = ()
-    # why the newest estimate does not continue them; it is then the new origin
+    # why the newest estimate does not continue them; if set, it is the new origin
     fault: str = ""
     last_fault: str = ""  # the newest such reason
 
@@ -219,7 +223,7 @@ class ScanMotion:
     views: tuple[ReducedScan, ...] = ()  # recent ones, oldest first
     # stamp of the first scan that contradicts odometry
     held_since_ns: int | None = None
-    held: str = ""  # what the newest scan contradicts, once others have before
+    held: str = ""  # what the newest scan contradicts, once earlier ones did too
     # fraction of the motion by odometry that the newest scan shows; NaN: undecided
     share: float = NAN
     push_s: float | None = None  # start of the push that was judged; None without one
@@ -227,14 +231,14 @@ class ScanMotion:
 
 @dataclass(frozen=True)
 class Ground:
-    """Ground around a robot whose lidar does not see all around it."""
+    """Ground around a robot whose lidar does not cover the full circle."""
 
     since_ns: int  # stamp from which times count
     # cells from the origin of odometry to the first: along x, along y
     corner: tuple[int, int]
-    # (n, n), rows along y: when a cell was last known to be free [s]; -inf: it is not known to be
+    # (n, n), rows along y: when a cell was last known to be free [s]; -inf: unknown
     times: Ranges
-    unseen: Array  # (Q, 2) middles of the cells where that ends, in `base_link` [m]
+    unseen: Array  # (Q, 2) centres of the cells at the border of known ground, in `base_link` [m]
 
 
 @dataclass(frozen=True)
@@ -244,7 +248,7 @@ class Push:
     since_s: float  # start
     last_s: float  # last integration
     moving_s: float  # last time that motion was commanded
-    # (3,) integral of the commanded twists [m, m, rad], in which forth and back cancel out
+    # (3,) integral of the commanded twists [m, m, rad]; back and forth cancel out
     commanded: Array
     # Times [s], `commanded` at those times, and poses (3,) by odometry, oldest first.
     marks: tuple[tuple[float, Array, Array], ...] = ()
@@ -254,7 +258,7 @@ class Push:
 class EStopState:
     """Known state of the emergency stop."""
 
-    latched: bool = False  # it was pressed, and not reset since
+    latched: bool = False  # pressed and not reset since
     held: bool = False  # its topic last reported it as pressed
     # time of the last message on its topic; None if there was none
     heard_s: float | None = None
@@ -263,7 +267,7 @@ class EStopState:
 
 @dataclass(frozen=True)
 class SensorState:
-    """Known state of a further sensor."""
+    """Known state of an additional sensor."""
 
     arrivals: Arrivals = Arrivals()  # of its accepted readings
     # (Q, 2) of the newest
@@ -278,10 +282,10 @@ class GateState:
     slope: Array  # (C,) its change per second
     published_s: float = -INF  # time of that publication
     shielded: bool = False  # the shield reduced it
-    now_s: float = -INF  # greatest time seen
+    now_s: float = -INF  # latest time of any input
     tick_s: float | None = None  # of the last tick
     awake_s: float = -INF  # of the last wake-up after a gap in the ticks
-    still_ticks: int = 0  # inputs in a row at which the clock stood still
+    still_ticks: int = 0  # consecutive inputs at which the clock did not advance
     clock_fault: str = ""  # at this input
     armed: bool = False  # commands pass
     latched: Cause | None = None  # the stop that only a reset clears
@@ -298,16 +302,17 @@ class GateState:
     estimates: EstimateTrack = EstimateTrack()
     command_s: float = -INF
     pending: Command | None = None  # whose scan has not arrived yet
-    # since when commands name such scans; None: the newest does not
+    # since when commands refer to such scans; None: the newest does not
     pending_s: float | None = None
     pending_arrival_s: float = -INF  # arrival of the pending command
     # recent ones, for the detection of motion; empty without shield
     views: tuple[View, ...] = ()
-    # None if the lidar sees all around, and without shield
+    # None if the lidar covers the full circle, or without shield
     ground: Ground | None = None
-    # (P, 3) in the newest scan: x, y in `base_link` [m], and greatest speed of each [m/s].
+    # (P, 3) in the newest scan: x, y in `base_link` [m], and maximum speed of each
+    # [m/s].
     obstacles: Array | None = None
-    # arrival of the scan behind the newest command, less its delay
+    # arrival of the scan behind the newest command, minus its delay
     behind_s: float = -INF
     malformed: str = ""  # what is wrong with the newest command
     source: str = ""  # the publisher of the newest command that named one
@@ -316,7 +321,7 @@ class GateState:
     last_mixed: str = ""  # the newest such sentence
     mixed_s: float = -INF  # its time
     seen: tuple[Sameness, ...] = ()  # pictures that the lidar has shown, newest last
-    frozen: str = ""  # why the newest scan is an old one
+    frozen: str = ""  # why the newest scan counts as frozen
     scan_motion: ScanMotion = ScanMotion()
     restless_s: float = -INF  # last time that odometry showed motion
     push: Push | None = None  # recent commanded motion; None if the robot was stopped

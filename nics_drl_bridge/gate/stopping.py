@@ -1,4 +1,4 @@
-"""Stopping behaviour of a robot, and a check for settings with which it could never move."""
+"""Stopping behaviour of a robot, and a check for settings that would prevent any motion."""
 
 import math
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ SHIELD_SPANS = {  # beyond them the robot could never move
 }
 HARDEST = SHIELD_SPANS["deceleration"][1]
 MIN_SHIELD_BEAMS = 2  # minimum number of beams that show the width of an obstacle
-# minimum number of data that must arrive while the gate settles, for a rate to be known
+# minimum number of data within the settling time for a rate to be known
 MIN_DATA = 2
 
 
@@ -38,7 +38,7 @@ def make_gate_config(
     shield: ShieldConfig | None,
     **rules: Any,
 ) -> GateConfig:
-    """Returns the configuration of a robot's gate; `rules` are further fields of it."""
+    """Returns the configuration of a robot's gate; `rules` are its other fields."""
     lidar = model.lidar
     robot = model.robot
     if "odom_rate" not in rules:
@@ -80,10 +80,10 @@ def shield_config(
     file: str | Path = "",
     overrides: Mapping[str, float] | None = None,
 ) -> tuple[ShieldConfig, str]:
-    """Returns a robot's shield, and a sentence on its values; ConfigError if one can't be used.
+    """Returns a robot's shield, and a sentence on its values; ConfigError for invalid values.
 
-    Values are from `shield` in the file of limits, else derived from model and limits; `overrides`
-    come first.
+    Values are from `shield` in the file of limits, or else derived from model and
+    limits; `overrides` take precedence.
     """
     if model.lidar.beams < MIN_SHIELD_BEAMS:
         fault = f"the shield needs a lidar of {MIN_SHIELD_BEAMS} beams or more"
@@ -136,7 +136,7 @@ def shield_config(
 
 
 def _adapt_turn(braking: Braking, stopping: Stopping) -> TurnBraking | None:
-    """Returns the turn's braking, worsened as much as `stopping` is worse than the speed's."""
+    """Returns the turn's braking, scaled by how much `stopping` is worse than the speed's."""
     turn = braking.turn
     if turn is None:
         return None
@@ -147,7 +147,7 @@ def _adapt_turn(braking: Braking, stopping: Stopping) -> TurnBraking | None:
 
 
 def derive_braking(model: SimulatorModel, limits: Limits | None) -> Braking:
-    """Returns how a robot stops, by its model, when its gate commands it to.
+    """Returns how a robot stops on a command of its gate, according to its model.
 
     Its base reads one command per period, and brakes no harder than its limits allow. Raises
     ConfigError for a model that does not come to rest.
@@ -195,7 +195,7 @@ def get_wheelbase(robot: RobotSpec) -> float:
 
 
 def require_possible(config: GateConfig) -> None:
-    """Raises ConfigError, with the parameter, for settings with which the gate can't be armed."""
+    """Raises ConfigError, naming the parameter, for settings that prevent arming."""
     for topic, rate, age in (
         ("scan", config.scan_rate, config.scan_age_s),
         ("odom", config.odom_rate, config.odom_age_s),
@@ -207,7 +207,7 @@ def require_possible(config: GateConfig) -> None:
                 f"parameter '{topic}_age': {fault}; give more than {1.0 / rate:.3g}."
             )
         if rate * config.settle_s < MIN_DATA:
-            fault = f"{declared}, too seldom to be judged within {config.settle_s:g} s"
+            fault = f"{declared}, too rarely to be judged within {config.settle_s:g} s"
             needed = f"the gate needs {MIN_DATA / config.settle_s:g} Hz or more"
             raise ConfigError(f"{fault}, so the robot could never move; {needed}.")
 

@@ -1,7 +1,8 @@
 """Rules that stop the robot by the age of data, the gate's own clock, commands and e-stop."""
-# Age is the time since arrival on the steady clock, plus delay. The envelope is the maximum lead of
-# stamps over that clock, the lead of the fastest data. Once the gate is armed, the envelope changes
-# no faster than real clocks drift: stamps that creep ahead or behind do not become the new normal.
+# Age is the time since arrival on the steady clock, plus delay. The envelope is the
+# maximum lead of stamps over that clock, i.e. the lead of the fastest data. Once the
+# gate is armed, the envelope changes no faster than real clocks drift, so that slowly
+# creeping stamps are not accepted as normal.
 
 import math
 
@@ -20,15 +21,15 @@ from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 # faults of a stamp
 REPEATED = "repeated"
 JUMPED = "jumped"
-# number of remembered stamps; a command on an older scan is on an unknown one
+# number of remembered stamps; older scans are unknown
 KEPT_STAMPS = 64
 MARK_S = 0.05  # time between two marks [s]
-DRIFT = 1e-3  # greatest drift between two clocks [s/s]; that of real machines is 1e-4
+DRIFT = 1e-3  # maximum drift between two clocks [s/s]; real machines drift by 1e-4
 SIMULATED_LAG = 0.2  # fraction of real time that a simulator may lose
-# data of an armed gate that lead the envelope by this are from the future [s]
+# data that lead an armed gate's envelope by more than this are from the future [s]
 AHEAD_S = 0.1
-SOURCE_S = 1.0  # time after which a command of another publisher is a new start [s]
-# a running clock does not give this many inputs in a row the same time
+SOURCE_S = 1.0  # time after which a command of another publisher is accepted [s]
+# a running clock never gives this many consecutive inputs the same time
 FROZEN_INPUTS = 20
 
 
@@ -78,7 +79,8 @@ def account_for_arrival(
     envelope = max(mark[3] for mark in marks)
     if armed:
         fall = SIMULATED_LAG if config.simulated else DRIFT
-        # A longer gap may be one of the gate itself, and data that queued meanwhile are late.
+        # A longer gap may be a pause of the gate itself, after which queued data are
+        # late.
         lowest = arrivals.envelope - fall * min(passed, gap_s)
         highest = arrivals.envelope + DRIFT * passed
         envelope = min(max(lead, lowest), highest)
@@ -107,7 +109,7 @@ def _append_mark(
 
 
 def reset_envelope(arrivals: Arrivals) -> Arrivals:
-    """Returns the arrivals with the envelope of the marked data alone, whatever it was before."""
+    """Returns the arrivals with an envelope computed only from the marks."""
     leads = [mark[3] for mark in arrivals.marks]
     return replace(arrivals, envelope=max(leads, default=arrivals.envelope))
 
@@ -143,7 +145,7 @@ def scan_silent(config: GateConfig, state: GateState, now: float) -> Cause | Non
 
 
 def sensor_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The newest reading of a further sensor is too old: it has stopped."""
+    """The newest reading of an additional sensor is too old: it has stopped."""
     ages = [
         (compute_age(sensor.arrivals, now), name)
         for name, sensor in zip(config.sensors, state.sensors, strict=True)
@@ -180,7 +182,7 @@ def measure_rate(
 
 
 def measure_creep(arrivals: Arrivals) -> float:
-    """Returns by how much the later half of the marks is further ahead of the steady clock [s]."""
+    """Returns the increase of the lead over the steady clock in the later half of the marks [s]."""
     leads = [mark[3] for mark in arrivals.marks]
     half = len(arrivals.marks) // 2
     return max(leads[half:]) - max(leads[:half]) if half else 0.0
@@ -189,7 +191,7 @@ def measure_creep(arrivals: Arrivals) -> float:
 def take_time(
     config: GateConfig, state: GateState, event: Input, now: float
 ) -> GateState:
-    """Records the time of an input, and what is wrong with it."""
+    """Records the time of an input, and any fault of the clock."""
     if not math.isfinite(now) or now < state.now_s:
         return replace(
             state, clock_fault=f"the steady clock went from {state.now_s} to {now} s"
@@ -218,12 +220,12 @@ def take_time(
 
 
 def own_clock(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The gate's clock is not to be trusted, or the gate was asleep."""
+    """The gate's clock can't be trusted, or the gate was asleep."""
     return make_cause("own_clock", "", state.clock_fault)
 
 
 def watch_source(state: GateState, command: Command, now: float) -> GateState:
-    """Records the publisher of a command, and whether another one commanded a moment ago."""
+    """Records the publisher of a command, and whether another one was recently active."""
     mixed = ""
     if command.publishers > 1:
         mixed = f"{command.publishers} nodes publish on {RAW}"

@@ -67,12 +67,12 @@ def open_bag(path: str | Path) -> "Iterator[BagFile]":
     """Opens a bag, given by its folder or its only file.
 
     Raises RecordingError if the bag is missing, damaged or empty, or if a library is missing.
-    Errors of the block that reads it stay what they are.
+    Errors of the block that reads it are not converted.
     """
     path = Path(path)
     check_libraries(path, "reading")
     if path.is_file() and not is_storage(path):
-        raise RecordingError(f"{path}: is no bag; {BAGS}")
+        raise RecordingError(f"{path}: is not a bag; {BAGS}")
     is_ros_1 = path.suffix == ROS_1
     with ExitStack() as stack:
         with _refuse_damage(path, is_ros_1):
@@ -83,7 +83,7 @@ def open_bag(path: str | Path) -> "Iterator[BagFile]":
 
 @contextmanager
 def _refuse_damage(path: Path, is_ros_1: bool) -> Iterator[None]:
-    """Turns whatever a reader raises on a damaged file into a RecordingError."""
+    """Converts any error of a reader on a damaged file to a RecordingError."""
     try:
         yield
     except BridgeError:
@@ -93,7 +93,7 @@ def _refuse_damage(path: Path, is_ros_1: bool) -> Iterator[None]:
         fault = f"can't be read as a bag ({shorten(reason, LONGEST_REASON)})"
         advice = "try `mcap recover` or `ros2 bag reindex` on a copy, or record again"
         if is_ros_1:
-            advice = "mend it with `rosbag reindex`, or record again"
+            advice = "repair it with `rosbag reindex`, or record again"
         raise RecordingError(
             f"{path}: {fault}; it is damaged or was not closed: {advice}."
         ) from None
@@ -152,9 +152,9 @@ def _find_place(path: Path) -> Path:
     if path.is_dir():
         if len(files) != 1:
             if not files:
-                raise RecordingError(f"{path}: holds no bag file; {BAGS}")
+                raise RecordingError(f"{path}: contains no bag file; {BAGS}")
             raise RecordingError(
-                f"{path}: holds {len(files)} bag files and no {METADATA}; write it "
+                f"{path}: contains {len(files)} bag files but no {METADATA}; write it "
                 "with `ros2 bag reindex`."
             )
         file = files[0]
@@ -178,7 +178,7 @@ def read_metadata(folder: Path) -> dict[str, Any]:
 
 
 def _list_files(folder: Path, room: Path) -> list[Path]:
-    """Returns the files of a bag; files compressed as a whole are unpacked to `room`."""
+    """Returns the files of a bag; compressed files are unpacked to `room`."""
     metadata = read_metadata(folder)
     names = metadata.get("relative_file_paths") or ()
     files = [folder / Path(str(name)).name for name in names]
@@ -210,7 +210,7 @@ def _check_storage(file: Path) -> None:
 
 
 def _check_summary(reader: "Reader") -> None:
-    """Refuses topics without a name and messages that unpack to too much.
+    """Refuses topics without a name and messages that are too large when unpacked.
 
     Whether a topic has as many messages as promised is checked when it is read.
     """
@@ -240,7 +240,7 @@ class BagFile:
     def __init__(self, reader: "AnyBag", place: str, is_ros_1: bool = False) -> None:
         if not reader.message_count:
             raise RecordingError(
-                f"{place}: holds no messages; record a drive of 20 s or more."
+                f"{place}: contains no messages; record a drive of 20 s or more."
             )
         self._reader = reader
         self._is_ros_1 = is_ros_1

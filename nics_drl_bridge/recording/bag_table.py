@@ -27,7 +27,7 @@ from nics_drl_bridge.recording.table import Column, Source, Table
 from nics_drl_bridge.robot.noise import Delay, Latency
 
 SCAN = "sensor_msgs/msg/LaserScan"
-FEWEST_MESSAGES = 20  # that show a delay
+FEWEST_MESSAGES = 20  # minimum number of messages that show a delay
 PERCENTILES = (5.0, 50.0, 95.0)
 SPANNED = 0.9  # fraction of a uniform distribution between the outer percentiles
 LONGEST_ARRAY = 64  # elements of longer arrays are not listed
@@ -69,8 +69,8 @@ def list_fields(message: Any, path: str = "") -> Iterator[str]:
 def make_field_reader(path: str) -> Callable[[Any], Any]:
     """Returns a function that reads a field of messages; NaN where a message lacks it.
 
-    What stands in brackets at the end is the name of an element, where the message names them, even
-    if it is a number or has dots.
+    Brackets at the end contain the name of an element if the message names them, even
+    if the name is a number or has dots.
     """
     parts = PART.findall(path)
     head, _, rest = path.partition("[")
@@ -141,7 +141,7 @@ def read_column(
     hint = suggest(path, names)
     inner = next((name for name in names if name.startswith(path)), None)
     if inner is not None:
-        hint = f"say which, as {inner!r}."
+        hint = f"choose one, such as {inner!r}."
     read = make_field_reader(path)
     try:
         values = [read(message.content) for message in messages]
@@ -154,7 +154,7 @@ def read_column(
     except (TypeError, ValueError):
         column = np.zeros((0, 0))
     if column.ndim != 1:
-        raise RecordingError(f"{place}: {path!r} is no single number; {hint}")
+        raise RecordingError(f"{place}: {path!r} is not a single number; {hint}")
     return column
 
 
@@ -170,14 +170,14 @@ class Bag(Source):
         super().__init__(bag.place, [t for t in topics if bag.can_decode(t)])
         self.file = bag
         self._frames: tuple[str | None, str | None] = (None, None)
-        # topics that are stamped together, and whether they come from the robot's computer
+        # topics that are stamped together; True if they come from the robot's computer
         self._used: dict[str, bool] = {}
         self._messages: dict[str, Sequence[Message]] = {}
         self._notes: dict[str, list[str]] = {}  # by topic
         self._stamps: dict[tuple[str, ...], Stream] = {}
 
     def use(self, mapping: mapped.Mapping) -> None:
-        """Stamps the topics of a mapping together; has to be called before they are read."""
+        """Stamps the topics of a mapping together; call this before reading them."""
         self._frames = mapping.pose.frames
         self._used = list_topics_used(mapping, self.names)
 
@@ -205,7 +205,7 @@ class Bag(Source):
         )
 
     def add_note(self, topic: str, note: str) -> None:
-        """Adds a sentence on what was done to a topic."""
+        """Adds a sentence on a repair of a topic."""
         self._notes.setdefault(topic, []).append(note)
 
     def _read_messages(self, topic: str) -> Sequence[Message]:
@@ -232,7 +232,8 @@ class Bag(Source):
             messages = self._read_messages(name)
             rows = np.arange(len(messages), dtype=np.float64)[:, None]
             data[name] = TopicData(name, *read_times(messages), rows)
-        # If other topics lack headers, these are compared with the arrival, as by default.
+        # If other topics lack headers, headers are compared with the arrival, as by
+        # default.
         bare = [name for name, part in data.items() if not np.any(part.header_ns)]
         stamps = STAMPS[which]
         if which == mapped.HEADER and bare and topic not in bare:

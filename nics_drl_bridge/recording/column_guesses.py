@@ -1,8 +1,8 @@
 """Guesses what the columns of a recording are, by their names, units and types.
 
-A column counts as a command only if its name, or the name and type of its topic, says so. A column
-that may be a command is listed as a candidate. Measurements are neither. The guesses serve only the
-draft of a mapping: opening a recording never guesses.
+A column counts as a command only if its name, or the name and type of its topic, shows
+it. A column that may be a command is listed as a candidate. Measurements are neither.
+The guesses serve only the draft of a mapping: opening a recording never guesses.
 """
 
 import re
@@ -45,7 +45,7 @@ HEADINGS = (
     "angle",
     "phi",
 )
-# Words of columns that hold places of something else, motions, sensor data or deviations
+# Words of columns with positions of something else, motions, sensor data or deviations
 OTHERS = word_set("""
     goal target waypoint waypoints ref reference setpoint desired initialpose
     marker markers obstacle obstacles landmark landmarks person people leg
@@ -63,7 +63,7 @@ TRACKERS = word_set("vicon mocap vrpn optitrack qualisys gt truth groundtruth tr
 LOCALISERS = word_set("pose amcl pf slam cartographer rtabmap filtered fused ekf")
 SENSORS = word_set("odom odometry imu gyro measured encoder wheel feedback model")
 SOURCES = TRACKERS | LOCALISERS | SENSORS | {"ground"}
-# Message types that hold positions of something else, or of a goal
+# Message types with positions of something else, or of a goal
 OTHER_PLACES = re.compile(
     r"^(visualization|actionlib|action|move_base|map)_msgs/"
     r"|/(Path|OccupancyGrid|MapMetaData|PoseArray|GridCells|Imu|Joy|LaserScan|MagneticField)$"
@@ -130,7 +130,7 @@ NEVER = word_set("""
 """)
 NOT_COMMANDED = NEVER | NO_COMMANDS | MEASURING
 WHEEL_WORDS = TICKS | word_set("wheel wheels rpm")
-# Words that show what a column holds
+# Words that show the content of a column
 EXPLAINED = NOT_COMMANDED | WHEEL_WORDS | word_set("x y z")
 NO_SPEED = word_set("""
     pos position angle current force torque slip distance dist pressure load
@@ -214,7 +214,7 @@ def guess_pose(tables: Sequence[TableSurvey]) -> PoseGuess | None:
     """Finds x, y and heading or quaternion by their names."""
     poses: list[PoseGuess] = []
     for table in tables:
-        # The names of several tables show what they hold.
+        # With several tables, their names show their content.
         if len(tables) == 1 or OTHERS.isdisjoint(split_words(table.name)):
             poses.extend(_find_named_poses(table))
     return max(poses, key=_rank_pose, default=None)
@@ -296,14 +296,14 @@ def _find_orientation(
 
 
 def _wraps(values: Array) -> bool:
-    """True for values that wrap as only an angle does, not a height."""
+    """True for values that wrap like an angle, unlike a height."""
     values = values[np.isfinite(values)]
     is_angle = np.all((values > -3.3) & (values < 6.4))
     return bool(is_angle and (np.abs(np.diff(values)) > NEARLY_A_TURN).any())
 
 
 class Switch(NamedTuple):
-    """A column that must have a certain value for the commands to count."""
+    """A column that must have a certain value for the commands to be valid."""
 
     column: Field
     on: float | str  # the value
@@ -466,7 +466,7 @@ class CommandGuess(NamedTuple):
     commands: dict[str, Candidate]  # by the robot's names; empty if none is certain
     # by the robot's names, for the user to choose from
     candidates: dict[str, Candidate]
-    # True if no command is certain and the motion of the wheels stands in for it
+    # True if no command is certain and the motion of the wheels is used instead
     of_wheels: bool = False
 
     @property
@@ -514,7 +514,8 @@ def _find_candidates(
     if STANDARD_PACKAGES.match(table.kind) and table.kind not in TWIST_KINDS:
         return
     has_pose = pose is not None and pose.table is table
-    # A file's name shows what it holds only if there are others and the pose is in one of them.
+    # A file's name shows its content only if there are other files and one contains the
+    # pose.
     context: set[str] = set()
     if table.kind or (has_others and not has_pose):
         context = {*split_words(table.name)}
@@ -686,7 +687,7 @@ def _match_commands(
 
 
 def _find_wheels(tables: Sequence[TableSurvey]) -> Iterator[Candidate]:
-    """Yields the measured ticks or speeds of wheels, which stand in for missing commands."""
+    """Yields the measured ticks or speeds of wheels, which replace missing commands."""
     for table in tables:
         if STANDARD_PACKAGES.match(table.kind):
             continue

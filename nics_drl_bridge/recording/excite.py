@@ -1,4 +1,4 @@
-"""Excitation: random drives within a circle that show a robot's whole motion."""
+"""Excitation: random drives within a circle that excite all of a robot's motion."""
 # Segments reach new levels smoothly and hold them for a random time (Nelles: Nonlinear System
 # Identification, ch. 21). A segment is accepted if it stays in the circle and the robot can turn
 # back from its end.
@@ -25,7 +25,7 @@ RAMP_S = 0.25
 SEGMENT_S = (0.4, 1.6)
 CANDIDATES = 12
 ALONE = 0.5  # probability of changing a single command
-REDRAWN = 0.6  # otherwise, probability of changing each further one
+REDRAWN = 0.6  # otherwise, probability of changing each additional one
 BINS = 4
 # weight of the distance from the centre against the familiarity of a command
 CENTRED = 2.0
@@ -116,7 +116,7 @@ class Exploration:
         return command
 
     def simulate(self) -> "Pattern | None":
-        """Drives to the end; None if it finds no way back, or if the commands vary too little."""
+        """Simulates the whole drive; None if it can't return, or the commands vary too little."""
         poses = [self.pose]
         commands = []
         while not self.done:
@@ -145,7 +145,7 @@ class Exploration:
         )
 
     def _limit(self) -> float:
-        """Returns the maximum allowed distance from the start, at least the present one [m]."""
+        """Returns the maximum allowed distance from the start, at least the current one [m]."""
         return max(self.keep_within, float(_compute_distance(self.pose))) + TOLERANCE_M
 
     def _predict(
@@ -208,7 +208,7 @@ class Exploration:
         return np.asarray(commands[allowed[best]])
 
     def _interpolate_commands(self, levels: Array, length: int) -> Array:
-        """Returns commands (K, T, C) that go smoothly from the present one to levels (K, C)."""
+        """Returns commands (K, T, C) that change smoothly from the current one to levels (K, C)."""
         fraction = (
             1.0 - np.cos(np.pi * np.minimum(np.arange(1, length + 1) / self._ramp, 1.0))
         ) / 2.0
@@ -231,7 +231,7 @@ class Exploration:
         return np.repeat(ways, round(needed / WAY_STEP_S), axis=1)
 
     def _measure_way_to_centre(self, pose: Array, state: Array, limit: float) -> Array:
-        """Returns how near to the centre ways back lead, over the radius; inf if there is none."""
+        """Returns how close to the centre return paths lead, over the radius; inf if none."""
         count = len(self._ways)
         start = np.repeat(pose, count, 0), np.repeat(state, count, 0)
         poses, _ = self._motion.predict(
@@ -255,7 +255,7 @@ class Exploration:
         return np.where(useful, reached / self._outermost, np.inf)
 
     def _return_to_circle(self, length: int) -> Array:
-        """Returns commands (T, C) for the way back that leaves the circle least."""
+        """Returns commands (T, C) for the return path that leaves the circle least."""
         away = _compute_distance(self._predict(self._emergency, WAY_STEP_S)[0])
         outside = np.maximum(away.max(axis=1) - self._outermost, 0.0)
         best = np.lexsort((away.min(axis=1), np.round(outside, 2)))[0]
@@ -309,7 +309,7 @@ class Pattern:
         return np.asarray(np.hypot(*self.twist[:, :2].T))
 
     def describe(self) -> tuple[str, ...]:
-        """Returns the lines that an operator must read before the robot moves."""
+        """Returns the text that an operator must read before the robot moves."""
         (left, low), (right, high) = self.box
         return (
             f"preview of {self.duration:.0f} s: a path of {self.speed.sum() * self.period:.1f} m, "
@@ -361,9 +361,9 @@ def predict_motion(spec: RobotSpec) -> ExpectedMotion:
     for command in spec.command:
         if not command.is_twist:
             raise ConfigError(
-                f"robot {spec.name!r}: where {command.name!r} in {command.unit} leads "
-                "can't be predicted; add `textbook:` and its `parameters:` to the "
-                "robot's YAML file."
+                f"robot {spec.name!r}: the effect of {command.name!r} in "
+                f"{command.unit} can't be predicted; add `textbook:` and its "
+                "`parameters:` to the robot's YAML file."
             )
     return ExpectedMotion(
         len(spec.state),

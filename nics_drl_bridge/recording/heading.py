@@ -13,9 +13,9 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 
 BLOCK_S = 0.5  # length of the pieces in which both turns are compared
-WINDOW_S = 5.0  # over which the disagreement is reported
-LONGEST_GAP_S = 0.25  # between two yaw rates that are joined
-MAX_POSE_PAUSE_S = 1.0  # between two poses of one drive
+WINDOW_S = 5.0  # time over which the disagreement is reported
+LONGEST_GAP_S = 0.25  # maximum gap between two yaw rates that are joined
+MAX_POSE_PAUSE_S = 1.0  # maximum time between two poses of one drive
 FEWEST_BLOCKS = 6
 FEWEST_TO_DRIFT = 10
 STANDING_MPS = 0.005  # wheels that roll more slowly in a whole block are at rest
@@ -34,7 +34,7 @@ LEAST_TURN_RAD = 1.0  # sum of all turns below which a drive does not show a sca
 MIN_SAME_MOTION_CORRELATION = (
     0.7  # minimum correlation of two sources that measure the same motion
 )
-# range of odometry's turns, relative to those of the gyro
+# plausible range of odometry's turns, relative to those of the gyro
 PLAUSIBLE_SCALES = (0.33, 5.0)
 IN_DEGREES = (40.0, 80.0)  # ratio of a rate in degrees to one in radians
 LEAST_APART_RAD = 0.02  # a smaller disagreement in `WINDOW_S` is not worth a correction
@@ -66,7 +66,7 @@ class Turning(GyroBias):
     alike: float  # correlation of both rates; NaN if the robot turned too little
     window_s: float
     apart: float  # root mean square disagreement after `window_s` [rad]; NaN if the drive is short
-    apart_std: float  # what the gyro's bias and scale may contribute to that [rad]
+    apart_std: float  # possible contribution of the gyro's bias and scale to that [rad]
 
     @property
     def compared(self) -> bool:
@@ -217,7 +217,7 @@ def _estimate_bias(blocks: _Blocks) -> GyroBias:
     rest_s = float(blocks.span[rest].sum())
     usual = float(np.median(rate))
     scatter = 1.4826 * float(np.median(np.abs(rate - usual)))
-    # Blocks in which somebody turned the robot do not count.
+    # Blocks in which somebody turned the robot are ignored.
     near = np.abs(rate - usual) <= max(5.0 * scatter, 1e-3)
     rate = rate[near]
     when = when[near]

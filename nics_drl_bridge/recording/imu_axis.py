@@ -1,4 +1,4 @@
-"""Finds by gravity which axis of an IMU points up: it may be mounted on its side or upside down."""
+"""Finds which axis of an IMU points up, by gravity, for any mounting."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -8,7 +8,8 @@ import numpy as np
 from nics_drl_bridge.geometry import Array
 
 AXES = "xyz"
-# Accelerations at rest [m/s^2]; beyond, gravity was removed or nothing was measured
+# Range of accelerations at rest [m/s^2]; otherwise gravity was removed or nothing was
+# measured
 GRAVITY = (7.0, 13.0)
 UPRIGHT = 0.85  # minimum fraction of gravity along the axis that points up
 # number of messages over which the acceleration is averaged while a robot drives
@@ -55,7 +56,7 @@ def to_array(vector: Any) -> Array:
 
 
 class GyroReader:
-    """Reads yaw rates from the messages of an IMU, however it is mounted."""
+    """Reads yaw rates from the messages of an IMU in any mounting."""
 
     def __init__(self) -> None:
         self._acceleration = np.zeros(3)

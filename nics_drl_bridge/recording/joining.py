@@ -1,7 +1,7 @@
 """Joins recordings of one robot into one, as episodes on one time axis that no window crosses.
 
-Each recording is split: its first part is learnt from, the rest is held out. All parts to learn
-from come first, so that one time separates them from the held-out parts.
+Each recording is split: its first part is for training, the rest is held out. All
+training parts come first, so that one time separates them from the held-out parts.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ LEARNT_SHARE = 2.0 / 3.0  # fraction of each recording
 # Time between two episodes, longer than any prediction and any search for a delay
 APART_S = 30.0
 LEAD_S = 2.0  # commands kept before an episode, so that states can follow them
-SETTLE_S = 5.0  # for which the first of these commands is held before them
+SETTLE_S = 5.0  # time for which the first of these commands is held before them
 AFTER_S = 5.0  # commands kept after an episode, for searches of a delay
 SHORTEST_SPLIT_S = 6.0  # shorter recordings are learnt from as a whole
 
@@ -124,7 +124,7 @@ def _split_recording(recording: Recording) -> list[_Part]:
 def _place_parts(
     recordings: Sequence[Recording], learnt: Sequence[_Part], held_out: Sequence[_Part]
 ) -> Recording:
-    """Lays parts out on one time axis; each pose begins where the one before ended."""
+    """Arranges parts on one time axis; each pose begins where the previous one ended."""
     shared = [*STREAMS]
     for recording in recordings:
         shared = [name for name in shared if name in recording.streams]
@@ -175,7 +175,7 @@ def _cut_part(part: _Part, names: Sequence[str]) -> dict[str, Stream]:
         if rows.sum() < 2:
             raise RecordingError(
                 f"{part.source}: has no {name} between {part.start_s:.1f} and "
-                f"{part.end_s:.1f} s; leave this recording, or its {name}, out."
+                f"{part.end_s:.1f} s; remove this recording, or its {name}."
             )
         cut[name] = stream.rows(rows)
     return cut
@@ -199,8 +199,8 @@ def _cut_commands(command: Stream, part: _Part) -> Stream:
 def _move_pose(pose: Stream, first: Array, place: Array) -> Stream:
     """Moves poses (T, 3) rigidly so that the first lies at a place (3,).
 
-    The robot's motion does not depend on its place. Between two episodes the pose is then at rest,
-    whatever their frames are.
+    The robot's motion does not depend on its position. Between two episodes the pose is
+    then at rest, regardless of their frames.
     """
     values = geometry.compose(place, geometry.between(first, pose.values))
     if pose.sigma is None:
@@ -219,7 +219,7 @@ def _append_streams(name: str, parts: Sequence[Stream]) -> Stream:
     for before, after in pairwise(parts):
         if after.t[0] < before.t[-1]:
             raise RecordingError(
-                f"{name}: two episodes overlap in time; this is a fault of ours."
+                f"{name}: two episodes overlap in time; please report this bug."
             )
     sigma = None
     sigmas = [part.sigma for part in parts if part.sigma is not None]
@@ -234,7 +234,7 @@ def _describe_join(sources: Sequence[str], is_split: bool) -> str:
     names = f"{sources[0]} to {sources[-1]}"
     if len(sources) <= 10:
         names = ", ".join(sources)
-    split = "all of them were fitted because they are too short to hold a part out"
+    split = "all of them were fitted because they are too short to hold out a part"
     if is_split:
         split = "the last third of each was held out of the first fit"
     return (

@@ -144,8 +144,8 @@ def _split_by_time(
     """
     if recording.pose.clock != recording.command.clock:
         raise ConfigError(
-            f"{source.place}: episode: pose and commands have clocks of their own; "
-            "give each episode as a recording of its own."
+            f"{source.place}: episode: pose and commands have separate clocks; give "
+            "each episode as a separate recording."
         )
     reader = MappedReader(source, mapping)
     table, which = reader.locate(mapping.episode or 0)
@@ -236,7 +236,7 @@ def _check_commands(reader: MappedReader, commands: Names[str, Value]) -> None:
             values = values[np.isfinite(values)]
             if len(values) and is_place_on_earth(column, values.min(), values.max()):
                 fault = f"{column!r} looks like a latitude or longitude"
-                fault += ", and was not sent to the robot; name a column that was"
+                fault += ", which was not sent to the robot; name a column that was"
         if fault:
             raise ConfigError(f"{table.place}: command.{name}: {fault}.")
 
@@ -335,7 +335,7 @@ def _read_command_topic(reader: MappedReader, topic: str, spec: RobotSpec) -> St
     fields = next((form for form in COMMANDS if {*form} <= {*table.names}), None)
     if fields is None:
         raise RecordingError(
-            f"{table.place}: its messages are no commands of a known form; name each "
+            f"{table.place}: its messages are not commands of a known form; name each "
             "command in the mapping."
         )
     is_steered = len(fields) == 2
@@ -343,8 +343,8 @@ def _read_command_topic(reader: MappedReader, topic: str, spec: RobotSpec) -> St
         if is_steered and variable.turns and not variable.steers:
             raise RecordingError(
                 f"{table.place}: holds steering angles [rad], but {variable.name!r} of "
-                f"robot {spec.name!r} is in {variable.unit}; choose the robot that "
-                "drove, or another topic."
+                f"robot {spec.name!r} is in {variable.unit}; choose the recorded "
+                "robot, or another topic."
             )
     values = {
         field: Value.model_validate({"from": f"{topic}:{field}"}) for field in fields
@@ -470,7 +470,7 @@ def _complete_pose(reader: MappedReader, pose: PoseSource) -> PoseSource:
             keys["covariance"] = covariance
         return PoseSource.model_validate({**mapped, **keys})
     raise RecordingError(
-        f"{table.place}: its messages are no poses of a known form; name x, y and "
+        f"{table.place}: its messages are not poses of a known form; name x, y and "
         "heading or quaternion in the mapping."
     )
 
@@ -558,7 +558,7 @@ def _find_spans(
             raise RecordingError(
                 f"{place}: {name} lasts from {first:.3f} to {last:.3f} s, the streams "
                 f"before it from {start:.3f} to {stop:.3f} s, on one clock; check "
-                "their `time:`, or give one of them a `clock:` of its own."
+                "their `time:`, or give one of them a separate `clock:`."
             )
         spans[stream.clock] = min(first, start), max(last, stop)
     return spans

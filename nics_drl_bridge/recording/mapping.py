@@ -98,7 +98,7 @@ def to_si(unit: str, ticks_per_turn: float | None) -> UnitOfData:
     return UNITS[unit]
 
 
-# Words of columns that can't have been sent to a robot: its place on Earth, and uncertainties
+# Words of columns that can't be commands: positions on Earth, and uncertainties
 PLACES_ON_EARTH = word_set("latitude longitude altitude")
 SHORT_OF_EARTH = word_set("lat lon lng long")
 NEAR_DEG = 1.0  # a drive stays within this range of latitude and longitude
@@ -107,9 +107,9 @@ NO_COMMANDS = PLACES_ON_EARTH | word_set(
 )
 
 NO_COMMAND_NAMED = (
-    "command: names none, but a model learns what the robot does from what was sent to it; name "
-    "its columns, or, if it was not recorded, record it together with the pose, such as "
-    "geometry_msgs/Twist on cmd_vel"
+    "command: names none, but a model learns the robot's motion from its commands; "
+    "name its columns, or, if it was not recorded, record it together with the pose, "
+    "such as geometry_msgs/Twist on cmd_vel"
 )
 
 ARRIVAL = "arrival"
@@ -154,7 +154,7 @@ def explain_no_command(column: str) -> str:
     content = "how uncertain a measurement is"
     if words & PLACES_ON_EARTH:
         content = "where the robot was"
-    return f"{column!r} tells {content}, and was not sent to the robot; name a column that was"
+    return f"{column!r} shows {content}, and was not sent to the robot; name a column that was"
 
 
 def may_be_place_on_earth(column: str) -> bool:
@@ -203,9 +203,10 @@ class Value(Schema):
     # encoder ticks per turn; with it, ticks become angles
     ticks_per_turn: float | None = Field(default=None, gt=0.0)
     differentiate: bool | None = None  # by default true for `ticks`, which are counters
-    # value at which a counter overflows; by default found from the data
+    # value at which a counter overflows; by default determined from the data
     wrap: float | None = Field(default=None, gt=0.0)
-    # flags: other columns, with the values at which this one counts; else `otherwise` counts
+    # flags: other columns, with the values at which this value is valid; if not,
+    # `otherwise` is used
     when: dict[str, Condition] = Field(default_factory=dict)
     otherwise: float = 0.0  # in SI, for rows whose flags do not match `when`
     # stamps of this value; None: the stream's

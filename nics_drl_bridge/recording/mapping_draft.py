@@ -30,7 +30,7 @@ from nics_drl_bridge.recording.survey import Field, TableSurvey
 
 GUESSED = "# guessed"
 NO_COMMAND = (
-    "no command was recorded, that is: nothing here was sent to the robot, such as "
+    "no command was recorded: nothing here was sent to the robot, such as "
     "geometry_msgs/Twist on cmd_vel; record it together with the pose"
 )
 NO_POSE = "# no pose was found: give x, y, and heading or quaternion, or `pose: /tf`"
@@ -48,16 +48,16 @@ EARLIEST_S = -1.0  # minimum delay that is tried
 IMPLAUSIBLE_LATENCY_S = 1.0
 PRECEDES_S = -0.3  # a motion this early precedes its command
 LEAST_CORRELATION = 0.3
-CLEAR_CORRELATION = 0.6  # minimum at which a latency is reported
+CLEAR_CORRELATION = 0.6  # minimum correlation at which a latency is reported
 MIN_STEPS = 100  # steps
 
 
 class MappingDraft(NamedTuple):
     """A draft of a mapping."""
 
-    doubts: Sequence[str]  # what the user should check first
+    doubts: Sequence[str]  # sentences on what the user should check first
     lines: Sequence[str]  # the mapping, in YAML
-    unused: Sequence[str]  # the columns that it does not use, a text for each table
+    unused: Sequence[str]  # unused columns, a text for each table
 
     @property
     def text(self) -> str:
@@ -112,13 +112,13 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
 def _find_doubts(
     guess: CommandGuess, poses: tuple[Array, Array] | None, time: str
 ) -> Iterator[str]:
-    """Yields sentences on a pose in the wrong unit, else on commands that the motion ignores.
+    """Yields sentences on a pose in the wrong unit, or else on commands without effect.
 
     `time` is the reference to the column of the stamps.
     """
     if poses is None:
         return
-    # A car may accelerate harder than a small robot, and only its kind tells.
+    # A car may accelerate harder than a small robot; only the kind distinguishes them.
     may_be_car = guess.kind is None or guess.kind.startswith("ackermann")
     fault = find_implausible_pose(*poses, radius=np.inf if may_be_car else USUAL_RADIUS)
     if fault is None:
@@ -131,7 +131,7 @@ def _find_doubts(
 def _write_robot(guess: CommandGuess) -> str:
     if guess.kind is None:
         return (
-            "robot:  # which kind is not certain, as in {kind: differential, "
+            "robot:  # the kind is not certain, for example {kind: differential, "
             f"footprint_radius: {USUAL_RADIUS}}}"
         )
     look_alikes = "".join(f", or {kind}" for kind in find_look_alikes(guess.kind))
@@ -159,7 +159,7 @@ def _write_commands(
         head += f"  # {NO_COMMAND}"
     elif guess.of_wheels:
         found = "none is certain" if guess.candidates else "no command was recorded"
-        head += f"  # {found}: what the wheels did stands in for it"
+        head += f"  # {found}: the measured wheel motion is used instead"
     elif not guess.commands:
         head += "  # none is certain: uncomment what was sent to the robot"
     yield head
@@ -190,7 +190,7 @@ def _write_unit_keys(name: str, column: Field) -> Iterator[str]:
 
 
 def _write_clock(pose: PoseGuess, commands: Mapping[str, Candidate]) -> Iterator[str]:
-    """Yields the line that gives the pose a clock of its own, if its stamps show one."""
+    """Yields the line that gives the pose a separate clock, if its stamps show one."""
     t = pose.table.t
     tables = [candidate.column.table for candidate in commands.values()]
     stamps = [(other.unit, np.sort(other.t)) for other in tables if other.t is not None]
@@ -293,7 +293,7 @@ def _compute_poses(
 def _compare_with_motion(
     guess: CommandGuess, stamps: Array, poses: Array
 ) -> Iterator[str]:
-    """Yields sentences on commands that the motion ignores, or follows much too early or late.
+    """Yields sentences on commands without effect, or with effects much too early or late.
 
     `stamps` are those (T,) of `poses` (T, 3) [s].
     """

@@ -23,7 +23,7 @@ _PART = 2**20
 
 
 def read_records(data: mmap) -> Iterator[tuple[int, McapRecord]]:
-    """Yields the records of a file, chunks unopened, with the offset of what follows each.
+    """Yields the records of a file, with chunks unopened, and the offset after each.
 
     Raises ValueError, or an error of the library, at a broken one.
     """
@@ -44,7 +44,7 @@ def unpack_chunk(chunk: Chunk) -> bytes:
     if chunk.compression:
         plain = unpack(plain, chunk.compression, chunk.uncompressed_size)
     if len(plain) != chunk.uncompressed_size:
-        raise ValueError("a chunk is not as long as it says")
+        raise ValueError("a chunk does not have its stated length")
     if chunk.uncompressed_crc and crc32(plain) != chunk.uncompressed_crc:
         raise ValueError("a chunk's checksum is wrong")
     return plain
@@ -62,7 +62,7 @@ def write_checksums(path: Path) -> None:
             place = end - CRC_BYTES
             if isinstance(record, Chunk):
                 crc = crc32(unpack_chunk(record))
-                # Behind it are two lengths, the compression and the data.
+                # It is followed by two lengths, the compression and the data.
                 place -= 12 + len(record.compression) + len(record.data)
             elif isinstance(record, DataEnd):
                 crc = crc32(view[: end - DATA_END_BYTES])
@@ -90,7 +90,7 @@ def check_mcap(path: Path) -> None:
                 if crc != record.summary_crc:
                     raise ValueError("the checksum of its summary is wrong")
         if data.tell() != len(data):
-            raise ValueError("it goes on behind its end")
+            raise ValueError("there are data after its end")
 
 
 def _import_zstd() -> Any:

@@ -148,12 +148,12 @@ def read_quaternion(message: Any) -> tuple[float, float, float, float]:
 
 
 def is_rotation(x: float, y: float, z: float, w: float) -> bool:
-    """True if a quaternion has about unit length; a zero quaternion was never filled in."""
+    """True if a quaternion has about unit length; a zero quaternion was never set."""
     return abs(w * w + x * x + y * y + z * z - 1.0) < LOOSE_QUATERNION_TOLERANCE
 
 
 def read_whole_pose(message: Any) -> Row:
-    """Returns the pose of a message; NaN if its orientation was never filled in."""
+    """Returns the pose of a message; NaN if its orientation was never set."""
     return (
         read_pose(message)
         if is_rotation(*read_quaternion(message))
@@ -192,7 +192,7 @@ def read_imu(message: Any) -> Row:
 
 @dataclass(frozen=True)
 class Offer:
-    """Quality of service that a publisher offers, as far as matching with subscribers needs it."""
+    """Quality of service that a publisher offers, as needed to match subscribers."""
 
     depth: int = 10  # depth of its history
     reliable: bool = True  # False for best effort

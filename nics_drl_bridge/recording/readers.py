@@ -68,7 +68,7 @@ def open_drives(
     """Opens drives of one robot, whose ranges cover all of them."""
     twice = [path for path in sources if sources.count(path) > 1]
     if twice:
-        raise RecordingError(f"{twice[0]}: is given twice; give each recording once.")
+        raise RecordingError(f"{twice[0]}: is given twice; name each recording once.")
     specs = []
     drives = []
     for path in sources:
@@ -118,7 +118,8 @@ def choose_mapping(
         return topics
     if topics not in (None, TopicRoles()):
         raise ConfigError(
-            "--topics and --topic do not go with --map; name the topics in the map."
+            "--topics and --topic can't be combined with --map; name the topics in "
+            "the map."
         )
     return mapping
 
@@ -133,7 +134,7 @@ def _read(
     has_bag = path.exists() and is_bag(path)
     if isinstance(mapping, TopicRoles) and mapping != TopicRoles() and not has_bag:
         raise RecordingError(
-            f"{path}: is no bag; leave out --topics and --topic, which are for bags "
+            f"{path}: is not a bag; remove --topics and --topic, which are for bags "
             "only."
         )
     if is_recording(path):
@@ -151,9 +152,7 @@ def _read(
         return drive, known
     if has_bag:
         if robot is None:
-            raise RecordingError(
-                f"{path}: is a bag; say of which robot, with a RobotSpec."
-            )
+            raise RecordingError(f"{path}: is a bag; give its robot as a RobotSpec.")
         spec = _build(robot)
         return _read_by_mapping(path, spec, mapping or TopicRoles()), spec
     if _holds(path, FILES):
@@ -175,8 +174,8 @@ def _read(
         raise RecordingError(f"{path}: no such file or folder; check the path.")
     raise RecordingError(
         f"{path}: is neither a bag nor a folder with {' and '.join(FILES)} nor an .npz "
-        f"file; say what is what in it with --map; `nics inspect {path.name} --map "
-        "my.yaml` begins one."
+        f"file; describe its content with --map; `nics inspect {path.name} --map "
+        "my.yaml` drafts a mapping."
     )
 
 
@@ -279,8 +278,8 @@ def reorder_variables(recording: Recording, spec: RobotSpec) -> Recording:
         if set(recorded) != set(names):
             raise ConfigError(
                 f"{recording.source}: the {part} is {', '.join(recorded)}, that of the "
-                f"robot {spec.name!r} is {', '.join(names)}; choose the robot that "
-                "drove, or use its names in the mapping."
+                f"robot {spec.name!r} is {', '.join(names)}; choose the recorded "
+                "robot, or use its names in the mapping."
             )
         order = [recorded.index(name) for name in names]
         made[part] = replace(stream, values=stream.values[:, order])

@@ -25,7 +25,7 @@ FORMAT = "nics_drl_bridge/recording/4"
 STREAMS = ("command", "pose", "state", "wheels", "imu", "odometry")
 MeasuredBy = Literal["", "odometry", "tracker", "truth"]
 """What measured a pose: odometry, which drifts; motion capture or a localiser; a simulation."""
-# A step that differs from the median by this fraction is a gap or a repetition.
+# A step that differs from the median by this fraction counts as a gap or a repetition.
 IRREGULAR = 0.5
 # Steps that differ by less count as equally long, except for rounding.
 JITTER = 1e-4
@@ -40,7 +40,7 @@ SLOWEST_SAMPLING_S = 2.0
 HARDEST = 14.0
 HARDEST_OF_CARS = 60.0
 SMALL_M = 1.0
-# Speed above which millimetres are likelier than centimetres [m/s]
+# Speed above which millimetres are more likely than centimetres [m/s]
 SLOWEST_IN_CM = 300.0
 FASTEST_TURN = 15.0  # a heading that turns faster for long is in degrees [rad/s]
 FULL_TURN_DEG = 360.0
@@ -99,7 +99,7 @@ class Stream:
 
 @dataclass(frozen=True)
 class Episode:
-    """A part of a recording that does not continue the part before, as after a reset."""
+    """A part of a recording that does not continue the previous part, as after a reset."""
 
     source: str  # the recording that it comes from, for the report
     # time of the first pose, and of the last, on the clock that pose and commands share [s]
@@ -135,11 +135,12 @@ class Recording:
     # a sentence on each repair made while reading, such as of clocks
     repairs: tuple[str, ...] = ()
     measured_by: MeasuredBy = ""  # what measured the pose; empty if unknown
-    # how odometry and gyro turned, if the heading is from the gyro or confirmed by it
+    # comparison of the turns by odometry and gyro, if the gyro gives or confirms the
+    # heading
     gyro: Turning | None = None
     episodes: tuple[Episode, ...] = ()  # in order; empty for a single drive
-    # end of the episodes to learn from, which come first [s after the first pose]; None if there
-    # are no episodes, or if the fit chooses
+    # end of the training episodes, which come first [s after the first pose]; None if
+    # there are no episodes, or if the fit chooses
     learn_until_s: float | None = None
 
     def episode_at(self, t: ArrayLike) -> NDArray[np.intp]:
@@ -161,7 +162,7 @@ class Recording:
         return np.asarray(t[0] + np.append(0.0, np.cumsum(step)))
 
     def driven_s(self, until_s: float = np.inf) -> float:
-        """Returns how long the robot drove until a time after the first pose [s], without gaps.
+        """Returns the driving time until a time after the first pose [s], without gaps.
 
         An episode counts in full if it begins before that time.
         """
@@ -217,7 +218,7 @@ def samples_on_one_clock(
 
 
 def _check_types(recording: object, spec: object) -> None:
-    """Raises ConfigError for a path or a name where the object is meant."""
+    """Raises ConfigError for a path or a name instead of the object."""
     if not isinstance(recording, Recording):
         raise ConfigError(
             f"recording={format_value(recording)}: must be a Recording, as "
@@ -243,7 +244,7 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
         raise RecordingError(
             f"{recording.source}: is a drive of a robot with "
             f"{', '.join(recording.variables)}; the robot {spec.name!r} has "
-            f"{', '.join(spec.variable_names)}: choose the robot that drove."
+            f"{', '.join(spec.variable_names)}: choose the recorded robot."
         )
     check_streams(
         recording, {"command": len(spec.command), "state": len(spec.state), "wheels": 2}
@@ -274,7 +275,7 @@ def _find_fault(stream: Stream, width: int) -> str:
     if values.shape != (len(t), width):
         return (
             f"has the shape {values.shape} where ({len(t)}, {width}) is needed; check "
-            "that the recording is of this robot"
+            "that this robot was recorded"
         )
     if len(t) < 2:
         return f"has {len(t)} samples; record a drive of 20 s or more"
@@ -355,8 +356,8 @@ def load_recording(path: str | Path) -> Recording:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (AttributeError, KeyError, RecursionError, TypeError) as error:
         raise RecordingError(
-            f"{path}: is not a recording of this package ({error}); say what is what "
-            "in it with --map, or write it with save_recording."
+            f"{path}: is not a recording of this package ({error}); describe its "
+            "content with --map, or write it with save_recording."
         ) from None
     except (ValueError, OSError) as error:
         raise RecordingError(
@@ -400,7 +401,7 @@ def _read_arrays(data: bytes) -> dict[str, NDArray[Any]]:
 
 
 class Implausible(NamedTuple):
-    """A fault of poses and what explains it."""
+    """A fault of poses and its explanation."""
 
     reason: str
     cause: str
@@ -451,11 +452,11 @@ def _find_degrees(t: Array, pose: Array) -> Implausible | None:
 def _find_wrong_degrees(pose: Array) -> Implausible | None:
     if not _is_only_along(pose, 180.0 / np.pi):
         return None
-    cause = "it was in radians, and is taken as degrees"
+    cause = "it was in radians, but is read as degrees"
     return Implausible(
         (
-            f"the heading is up to {np.abs(pose[:, 2]).max():.2g} rad, and the path leads "
-            "along 57 times as much"
+            f"the heading is up to {np.abs(pose[:, 2]).max():.2g} rad, and the path "
+            "follows 57 times that angle"
         ),
         cause,
         "heading_unit: rad",
@@ -549,7 +550,7 @@ def _find_too_fast(
         line = "unit: mm"
     if speed > TOO_FAST * fastest:
         reason = (
-            f"moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s"
+            f"moves at {speed:.3g} m/s, but its commands are at most {fastest:g} m/s"
         )
         return Implausible(reason, cause, line)
     if np.isfinite(fastest) or len(span) < 3:

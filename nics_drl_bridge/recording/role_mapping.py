@@ -1,4 +1,4 @@
-"""Writes the mapping that the roles of a bag's topics stand for."""
+"""Converts the roles of a bag's topics to a mapping."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -62,12 +62,13 @@ def write_mapping(roles: TopicRoles, bag: Bag, spec: RobotSpec) -> Mapping:
 
 
 def _map_imu(bag: Bag, topic: str) -> dict[str, Any]:
-    """Returns the values of an IMU, however it is mounted."""
+    """Returns the values of an IMU in any mounting."""
     table = bag.get_table(topic)
     axis = find_table_axis(lambda name: read_numbers(table, name))
     if not axis.is_usual:
         note = (
-            f"imu: by gravity its axis {axis.name} points up, so that is its yaw axis."
+            f"imu: according to gravity its axis {axis.name} points up, so that is its "
+            "yaw axis."
         )
         bag.add_note(topic, note)
     rate = {"from": f"angular_velocity.{AXES[axis.place]}", "scale": axis.sign}
@@ -195,7 +196,7 @@ def read_joint_streams(
         is_whole = np.asarray(np.isfinite(rows).all(axis=1))
         if not is_whole.any():
             raise RecordingError(
-                f"{table.place}: no message tells all of {', '.join(values)}; check "
+                f"{table.place}: no message contains all of {', '.join(values)}; check "
                 "what the joints' driver publishes."
             )
         streams[name] = TopicData(topic, *read_times(messages), rows).rows(is_whole)

@@ -20,8 +20,8 @@ Nanoseconds = NDArray[np.int64]
 
 RECEIVE = "receive"
 HEADER = "header"
-# Range of the median delay from header to receipt on the recorder's own clock: a localiser may take
-# its time, but nothing is received before it was stamped.
+# Range of the median delay from header to receipt on the recorder's own clock: a
+# localiser may be slow, but nothing is received before it was stamped.
 SAME_CLOCK_S = (-0.001, 1.0)
 # The delay from headers of one clock to their receipt varies by less.
 MAX_WANDER_S = 1.0
@@ -29,9 +29,10 @@ MAX_WANDER_S = 1.0
 STALLED = 2.0
 MAX_STALL_S = 30.0
 MAX_LATE = 0.01  # fraction of messages that may arrive after one with a later stamp
-# fraction that may lack a stamp at the start, because a simulation has no time yet
+# fraction of messages that may lack a stamp at the start, when a simulation has no time
+# yet
 MAX_UNSTAMPED = 0.05
-# Streams from one computer, and so on one clock
+# Streams from one computer, hence on one clock
 ROBOT_STREAMS = ("command", "command_topic", "state", "wheels", "imu")
 
 SPLIT = (
@@ -41,7 +42,7 @@ SPLIT = (
     ("sec", "nsec"),
     ("sec", "nsecs"),
 )
-# Stamps in whole seconds with this many rows each have lost their fraction.
+# Stamps in whole seconds with this many rows each are truncated.
 ROWS_A_SECOND = 5
 # A counter takes more than COUNTING usual steps from one overflow to the next, loses at most
 # MAX_LOST_STEPS at each, and reaches each of PARTS parts of its range.
@@ -54,7 +55,7 @@ ONE_WAY = 0.95
 # A speed goes back by more than this fraction of its steps, within a range of fewer usual steps.
 BACK = 0.2
 WITHIN = 25.0
-TREMBLING = 4.0  # range of the ticks of a wheel that stands still
+TREMBLING = 4.0  # range of the ticks of a wheel at rest
 BITS = (8, 16, 24, 31, 32)  # sizes of registers that overflow
 STAMP_BITS = (16, 24, 31, 32)
 # Late rows come in runs of at most this length, late by at most this time.
@@ -126,7 +127,7 @@ def stamp_streams(
 
 
 def has_continuous_headers(parts: Iterable[TopicData]) -> bool:
-    """True if all headers, in order of receipt, continue without a leap."""
+    """True if all headers, in order of receipt, are continuous."""
     parts = list(parts)
     receive_ns = np.concatenate([part.receive_ns for part in parts])
     headers = [part.header_ns for part in parts]
@@ -147,8 +148,8 @@ def _measure_delay(delay_ns: Nanoseconds, place: str, topic: str) -> int:
     if wander > MAX_WANDER_S or (maximum - median) * S_PER_NS > MAX_STALL_S:
         fault = (
             f"its header stamps lie {minimum * S_PER_NS:.3f} to "
-            f"{maximum * S_PER_NS:.3f} s before their receipt, so they are of "
-            "several clocks or of a simulated time at another rate"
+            f"{maximum * S_PER_NS:.3f} s before their receipt, so they come from "
+            "several clocks or from a simulated time at another rate"
         )
         advice = (
             f"{USE_RECEIPT}, or for a simulation `stamps: header` (`time: header`), and record "
@@ -270,7 +271,7 @@ def unwrap_counter(values: Array, size: float) -> tuple[Array, int]:
 
 
 def describe_counter(values: Array) -> str:
-    """Describes what shows that integers (T,) are a counter; empty if nothing does."""
+    """Returns the reason why integers (T,) look like a counter, or ""."""
     if not (values == np.round(values)).all():
         return ""
     step = np.abs(np.diff(values))
@@ -299,7 +300,7 @@ def is_oscillating(values: Array) -> bool:
 
 
 def count_rows_a_second(t: Array) -> int:
-    """Returns the rows per second of stamps (T,) that have lost their fraction; else 0."""
+    """Returns the rows per second of stamps (T,) that are truncated to seconds; else 0."""
     seconds = np.unique(t)
     if len(t) < ROWS_A_SECOND * len(seconds) or (t != np.round(t)).any():
         return 0
@@ -336,8 +337,8 @@ def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
     stray = _find_stray(t)
     if stray.any():
         notes.append(
-            f"{name}: {stray.sum()} stamps fit none beside them (row {rows[stray][0]}: "
-            f"{t[stray][0]:.10g} s); left out."
+            f"{name}: {stray.sum()} stamps do not fit their neighbours (row "
+            f"{rows[stray][0]}: {t[stray][0]:.10g} s); left out."
         )
         t = t[~stray]
         rows = rows[~stray]
@@ -403,7 +404,7 @@ def select_new_rows(
     note = ""
     if is_repeated.any():
         note = (
-            f"{name}: {int(is_repeated.sum())} of {len(t)} rows repeat the row before "
-            "them, stamp and all, and were left out."
+            f"{name}: {int(is_repeated.sum())} of {len(t)} rows repeat the previous "
+            "row, including its stamp, and were left out."
         )
     return np.append(True, ~is_repeated), note

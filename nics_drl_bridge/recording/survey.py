@@ -23,7 +23,7 @@ from nics_drl_bridge.recording.values import parse_dates
 
 GAP = 5.0  # a gap is longer than this many usual steps
 MOST_COLUMNS = 200  # maximum number of columns of a table that are surveyed
-# Stamps that would be closer are not in the unit that their name states.
+# Stamps with smaller steps are not in the unit that their name states.
 SHORTEST_STEP_S = 1e-4
 LEAST_SCORE = 0.25  # minimum score of a column of stamps
 MAX_BACKWARD_FRACTION = 0.05  # maximum fraction of backward steps of a column of stamps
@@ -165,7 +165,8 @@ class TableSurvey:
     name: str
     rows: int
     columns: list[Field] = field(default_factory=list)
-    # column of the stamps, or of seconds and nanoseconds; empty if they come with the rows
+    # columns of the stamps (one, or seconds and nanoseconds); empty if stamps come with
+    # the rows
     stamp_columns: Sequence[str] = ()
     unit: str | None = None  # unit of the stamps, unless seconds
     findings: list[str] = field(default_factory=list)
@@ -207,7 +208,7 @@ class TableSurvey:
 
     @property
     def regularity(self) -> list[str]:
-        """Sentences on rate, gaps, stamps that run backwards, repeated rows and missing values."""
+        """Returns sentences on rate, gaps, backward stamps, repeated rows and missing values."""
         if self.t is None or len(self.t) < 2:
             return []
         return list(_describe_regularity(self.t, _select_numbers(self.data)))

@@ -84,8 +84,8 @@ def _find_column(place: str, names: Sequence[str], which: str | int) -> int:
         if count > 1:
             numbers = [str(k) for k, name in enumerate(names) if name == which]
             raise RecordingError(
-                f"{place}: {count} columns are called {which!r}; give the number of "
-                f"the one you mean: {' or '.join(numbers)}."
+                f"{place}: {count} columns are called {which!r}; choose one by number: "
+                f"{' or '.join(numbers)}."
             )
         return names.index(which)
     if isinstance(which, int) or which.isdecimal():
@@ -103,7 +103,7 @@ def _find_column(place: str, names: Sequence[str], which: str | int) -> int:
 
 
 def is_text(column: Column) -> bool:
-    """True if a column holds text, not numbers."""
+    """True if a column contains text, not numbers."""
     return column.dtype.kind in "US"
 
 
@@ -118,8 +118,8 @@ def read_numbers(table: Table, which: str | int) -> Array:
         except ValueError:
             raise RecordingError(
                 f"{table.place}: {table.row(k)}: column {which!r} is "
-                f"{str(text)[:40]!r}, which is no number; mend or remove the row, or "
-                "choose another column."
+                f"{str(text)[:40]!r}, which is not a number; correct or remove the "
+                "row, or choose another column."
             ) from None
     return np.array([float(text or "nan") for text in column])
 

@@ -29,13 +29,14 @@ MOST_FILES = 500  # maximum number of files that are read from a folder
 SEPARATORS = (",", ";", "\t", "|", None)  # None: any white space
 NO_SEPARATOR = re.compile(r"[\w\s.,;|+\"'#-]")
 MAX_TABLE_BYTES = 256 * 2**20
-MAX_UNPACKED_BYTES = 2**30  # of an .npz file, whose arrays may be packed a thousandfold
+# of an .npz file, whose arrays may be compressed a thousandfold
+MAX_UNPACKED_BYTES = 2**30
 # Maximum number of rows, and of characters in one
 MOST_ROWS = 2_000_000
 LONGEST_ROW = 20_000
 TRIED = 400  # lines from which separator and header are found
 MOST_SAMPLED = 50_000  # rows from which their usual width is found
-MOST_BROKEN = 0.01  # maximum fraction of rows that are left out for their width
+MOST_BROKEN = 0.01  # maximum fraction of rows that are skipped because of their width
 COMMENTS = ("#", "//", "%")
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -111,7 +112,7 @@ def _read_lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
     for k, line in lines:
         if len(line) > LONGEST_ROW:
             raise RecordingError(
-                f"{path}: line {k} has {len(line)} characters, which no row has; "
+                f"{path}: line {k} has {len(line)} characters, too many for a row; "
                 "remove it."
             )
     comments = [
@@ -178,7 +179,7 @@ def _find_first_row(path: Path, rows: list[list[str]]) -> tuple[int, int]:
     )
     if not widths:
         raise RecordingError(
-            f"{path}: holds no row of numbers; give a table of numbers, a column each, "
+            f"{path}: contains no row of numbers; give a table of numbers in columns, "
             "with or without a header."
         )
     width = widths.most_common(1)[0][0]
@@ -194,7 +195,7 @@ def _keep_one_width(
     above: list[list[str]],
     width: int,
 ) -> tuple[list[list[str]], NDArray[np.intp], list[str]]:
-    """Leaves out repeated headers and the few rows of another length."""
+    """Skips repeated headers and the few rows of another length."""
     notes = []
     is_data = np.array([row not in above for row in rows], dtype=np.bool_)
     if not is_data.all():
@@ -207,7 +208,7 @@ def _keep_one_width(
     if len(broken) > max(1.0, MOST_BROKEN * is_data.sum()):
         raise RecordingError(
             f"{path}: line {line_numbers[broken[0]]} has {len(rows[broken[0]])} fields "
-            f"where most lines have {width}; mend or remove it and those like it."
+            f"where most lines have {width}; correct or remove all such lines."
         )
     if len(broken):
         where = ", ".join(map(str, line_numbers[broken[:5]]))
@@ -303,7 +304,7 @@ def read_arrays(path: Path) -> Table:
     columns = list(flatten_arrays(arrays))
     if not columns:
         raise RecordingError(
-            f"{path}: holds no columns; give arrays of one value or more a row."
+            f"{path}: contains no columns; give arrays of one or more values per row."
         )
     return make_table(
         str(path), tuple(name for name, _ in columns), tuple(c for _, c in columns)
@@ -363,7 +364,8 @@ class Files(Source):
             ]
             if not files:
                 raise RecordingError(
-                    f"{path}: holds no file of a known format ({', '.join(suffixes)})."
+                    f"{path}: contains no file of a known format "
+                    f"({', '.join(suffixes)})."
                 )
             self._files = {
                 file.relative_to(path).as_posix(): file for file in files[:MOST_FILES]

@@ -217,20 +217,18 @@ class _Topics:
                     f"{topic} ({self.types[topic]})" for topic in topics
                 )
                 fault = f"each of several topics could be {role}: {several}"
-                advice = f"say which with --topic {role}={topics[0]}"
+                advice = f"choose one with --topic {role}={topics[0]}"
                 if role != "cmd_vel":
                     advice += f", or {role}={NONE} for none"
                 raise RecordingError(f"{self.place}: {fault}; {advice}.")
         return None
 
     def describe_missing(self, roles: Sequence[str], words: str) -> str:
-        """Returns that no topic has any of the roles, and the fix."""
+        """Returns a sentence that no topic has any of the roles, with the fix."""
         kinds = dict.fromkeys(chain.from_iterable(TYPES[role] for role in roles))
         advice = f"record one of type {', '.join(kinds)}"
         if roles == ("cmd_vel",):
-            advice += (
-                " with the pose, since a model learns from what was sent to the robot"
-            )
+            advice += " with the pose, since a model learns from the robot's commands"
         advice += ", or, if another topic holds them, name it with --map, which "
         advice += "`nics inspect BAG --map my.yaml` begins"
         for role in roles:

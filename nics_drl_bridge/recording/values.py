@@ -29,9 +29,9 @@ from nics_drl_bridge.recording.table import (
     read_numbers,
 )
 
-ZONE = re.compile(r"(?:Z|([+-])(\d\d):?(\d\d))$")  # of a date: its offset from UTC
+ZONE = re.compile(r"(?:Z|([+-])(\d\d):?(\d\d))$")  # offset of a date from UTC
 CLOCK = re.compile(r"\d\d:\d\d:\d\d")  # a time of day
-AT_ONCE = 0.25  # rows closer than this fraction of the mean step come at once
+AT_ONCE = 0.25  # rows closer than this fraction of the mean step count as simultaneous
 MOST_LISTED = 20  # maximum number of tables listed in an error
 CLOSE = 1e-9  # maximum difference of a flag from the number that it equals
 
@@ -126,8 +126,8 @@ class MappedReader:
         stamped = self._stamped_rows[key]
         if stamped.total != count:
             raise RecordingError(
-                f"{table.place}: has {stamped.total} stamps for {count} values; say "
-                "which are theirs with `time:` next to `from:`."
+                f"{table.place}: has {stamped.total} stamps for {count} values; choose "
+                "the right ones with `time:` next to `from:`."
             )
         return stamped
 
@@ -136,8 +136,8 @@ class MappedReader:
         stream = table.stamps("" if time is None else str(time.from_))
         if stream is None:
             raise RecordingError(
-                f"{table.place}: which column is the time? Say as in `time: t`, `time: "
-                "[s, ns]`, or `time: {rate: 50}` if there is none."
+                f"{table.place}: which column is the time? Write `time: t`, `time: [s, "
+                "ns]`, or `time: {rate: 50}` if there is none."
             )
         self.add_notes(*table.notes)
         default_clock = stamping.RECEIVE
@@ -148,7 +148,7 @@ class MappedReader:
         return StampedRows(stream.t, rows, clock, len(table.column(0)))
 
     def _read_stamps(self, table: Table, time: schema.Time) -> StampedRows:
-        """Reads stamps from columns of a table, and repairs what loggers did to them."""
+        """Reads stamps from columns of a table, and repairs typical faults of loggers."""
         names = [self._locate_beside(table, column)[1] for column in time.columns]
         column = table.column(names[0])
         dates = parse_dates(column) if is_text(column) and len(names) == 1 else None
@@ -211,13 +211,13 @@ class MappedReader:
         if len(infinite) and not allow_infinite:
             row = table.row(int(stamped.rows[infinite[0]]))
             raise RecordingError(
-                f"{table.place}: {row}: column {column_name!r} is infinite; mend or "
+                f"{table.place}: {row}: column {column_name!r} is infinite; correct or "
                 "remove the row."
             )
         is_finite = np.isfinite(raw)
         if not is_finite.any():
             raise RecordingError(
-                f"{table.place}: {column_name!r} holds no number; choose another "
+                f"{table.place}: {column_name!r} contains no number; choose another "
                 "column."
             )
         if not is_finite.all():
@@ -241,7 +241,7 @@ class MappedReader:
             if stamping.is_oscillating(series.values):
                 raise RecordingError(
                     f"{self.source.place}: {value.from_!r} goes up and down like a "
-                    "speed, and is no counter: write `unit: "
+                    "speed, so it is not a counter: write `unit: "
                     f"{value.unit or 'ticks'}/s` for {name}."
                 )
             series = _derive_rate(series, held)
@@ -292,7 +292,7 @@ class MappedReader:
                 f"{flag} is {wanted!r}" for flag, wanted in value.when.items()
             )
             raise RecordingError(
-                f"{table.place}: {value.from_!r} never counts: there is no row in "
+                f"{table.place}: {value.from_!r} is never valid: there is no row in "
                 f"which {conditions}; check `when:`."
             )
         values = np.where(counts, series.values, value.otherwise)
@@ -344,7 +344,7 @@ def _match_table(wanted: str, names: Sequence[str]) -> str | None:
 def parse_dates(column: Column) -> Array | None:
     """Returns seconds since 1970 of dates like 2024-05-01 12:00:00.5; None for other text.
 
-    Dates with an offset such as +02:00 count as what they are in UTC, others as UTC.
+    Dates with an offset such as +02:00 are converted to UTC; others are taken as UTC.
     """
     text = [ZONE.sub("", str(date)).replace("/", "-") for date in column]
     if text and CLOCK.match(text[0]):
@@ -370,7 +370,8 @@ def _read_offset(date: str) -> int:
 def _derive_rate(counter: Series, held: bool) -> Series:
     """Differentiates a counter between stamps, so that the rate's integral is exact.
 
-    Of rows that come at once, only the last is used: ticks between them would take no time.
+    Of simultaneous rows, only the last is used, because ticks between them would take
+    no time.
     """
     is_last = np.ones(len(counter.t), dtype=np.bool_)
     if len(counter.t) > 1:
@@ -401,7 +402,7 @@ def combine_series(name: str, parts: Sequence[Series], held: bool) -> Stream:
     clocks = sorted({part.clock for part in parts})
     if len(clocks) > 1:
         raise ConfigError(
-            f"{name}: its values are of the clocks {' and '.join(clocks)}; a stream "
+            f"{name}: its values have the clocks {' and '.join(clocks)}; a stream "
             "needs one clock."
         )
     t = parts[0].t
@@ -414,9 +415,7 @@ def combine_series(name: str, parts: Sequence[Series], held: bool) -> Stream:
             stop = np.inf
         t = t[(t >= start) & (t <= stop)]
         if not len(t):
-            raise RecordingError(
-                f"{name}: its values are of times that do not overlap."
-            )
+            raise RecordingError(f"{name}: the times of its values do not overlap.")
         columns = [np.interp(t, part.t, part.values) for part in parts]
         if held:
             rows = [np.searchsorted(part.t, t, side="right") - 1 for part in parts]

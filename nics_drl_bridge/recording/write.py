@@ -37,7 +37,7 @@ Storage = Literal["mcap", "sqlite3"]
 
 NPZ = ".npz"
 START_NS = 1_700_000_000 * NS_PER_S  # time stamp of second 0 of the commands' clock
-# Lag of other clocks, too long for a reader to take it for a delay
+# Offset of other clocks, too large to be mistaken for a delay
 APART_NS = 3600 * NS_PER_S
 FRAMES = ("odom", "base_link")
 NO_HASH = f"RIHS01_{'0' * 64}"  # hash of a type that is known only by its definition
@@ -52,7 +52,7 @@ def check_out(path: str | Path) -> Path:
     """
     path = Path(path)
     if path.exists():
-        raise ConfigError(f"{path}: is there already; give another name, or remove it.")
+        raise ConfigError(f"{path}: already exists; give another name, or remove it.")
     if path.suffix not in (NPZ, ""):
         raise ConfigError(
             f"{path}: unknown kind of recording {path.suffix!r}; name a file *{NPZ}, "
@@ -64,7 +64,7 @@ def check_out(path: str | Path) -> Path:
 
 
 def write_drive(recording: Recording, path: str | Path, spec: RobotSpec) -> None:
-    """Writes a recording, whole or not at all: `.npz`, which names its robot, or a rosbag2."""
+    """Writes a recording atomically, as `.npz`, which names its robot, or as a rosbag2."""
     if Path(path).suffix == NPZ:
         save_recording(replace(recording, robot=spec.model_dump(mode="json")), path)
     else:
@@ -273,12 +273,13 @@ def open_bag_sink(
 ) -> Iterator[BagSink]:
     """Yields a bag, which becomes a folder at the end.
 
-    Until then it is in a hidden folder `.NAME.*` next to it. If the storage fails, as on a full
-    disk, what was written stays in such a folder.
+    Until then it is in a hidden folder `.NAME.*` next to it. If the storage fails, for
+    example on a full disk, the data written so far stay in such a folder.
 
-    `keep` is for data that can't be had again, such as a recording. If the block raises, the bag is
-    finished with what was written. What a killed process leaves also stays. Without `keep`, the
-    block leaves nothing if it raises, and the next write removes what a killed process left.
+    `keep` is for data that can't be reproduced, such as a recording. If the block
+    raises, the bag is finished with the data written so far. The files of a killed
+    process also stay. Without `keep`, the block leaves nothing if it raises, and the
+    next write removes the files of a killed process.
 
     Raises RecordingError if the path exists or can't be made, or if a library is missing.
     """
@@ -287,9 +288,7 @@ def open_bag_sink(
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     if path.exists():
-        raise RecordingError(
-            f"{path}: is there already; give the name of a new folder."
-        )
+        raise RecordingError(f"{path}: already exists; give the name of a new folder.")
     check_above(path)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     path.parent.mkdir(parents=True, exist_ok=True)

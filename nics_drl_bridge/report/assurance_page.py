@@ -21,9 +21,9 @@ MAX_SEEDS = 5  # of a cluster that the table shows
 NOT_SHOWN = (
     "Safety of the vehicle: this is evidence from a simulator, not a certificate. The bounds hold "
     "for the scenes, drivers and delays that this protocol draws.",
-    "That the vehicle brakes as its model does. Measure its latency and deceleration.",
+    "That the vehicle brakes like its model. Measure its latency and deceleration.",
     "Obstacles that the lidar does not see, or that are faster than the shield's obstacle_speed.",
-    "The end of the gate's process or of the machine: there the base must stop by itself.",
+    "A crash of the gate's process or of the machine: the base itself must then stop.",
 )
 
 
@@ -39,7 +39,7 @@ def make_assurance_page(
     )
     title = "Safety evidence for a command gate"
     if protocol.control:
-        lead = f"{subject}. Control: nothing was gated, so failures must appear."
+        lead = f"{subject}. Control: the gate was off, so failures must appear."
         title = "Control of safety evidence: the gate was off"
     sections = [
         ("Result", _make_result(protocol, results)),
@@ -110,8 +110,9 @@ def _list_limits(results: Mapping[str, Any], shown: Mapping[str, Any]) -> list[s
     sentences = []
     if results["not_injected"]:
         sentences.append(
-            f"{results['not_injected']:,} faults could not be injected, because the robot did not "
-            "move. So the claim on stopping in time is not met; the same command tries them again."
+            f"{results['not_injected']:,} faults could not be injected, because the "
+            "robot did not move. Therefore the claim on stopping in time is not met; "
+            "repeat the same command to inject them."
         )
     elif not shown[STOPS]["trials"]:
         sentences.append(
@@ -171,8 +172,8 @@ def _make_failures(
     heads = ("claim", "driver or fault", "world", "near x, y [m]", "failures", "seeds")
     count = f"Failed trials: {len(results['failures']):,}. Clusters: {len(clusters):,}."
     told = (
-        "Replay one by its seed. An episode is the same bit for bit, and drawn; a fault is "
-        "injected again, at another moment:"
+        "Replay one by its seed. An episode is repeated bit for bit and drawn; a "
+        "fault is injected again, at another time:"
     )
     return [
         html.make_paragraph(count),
@@ -223,12 +224,12 @@ def _make_method(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
         f"policy for up to {POLICY_S:g} s: {path_km:.2f} km in {hours:.2f} h with the gate.",
         f"Scans reach the gate up to {MAX_SCAN_DELAY_S:g} s late, and commands arrive up to "
         f"{MAX_COMMAND_DELAY_S:g} s late before and after the gate; each episode draws its delays.",
-        "A touch is a failure if the robot moved. In "
-        f"{results['walked_into']:,} episodes something walked into a robot that stood.",
+        f"A contact is a failure if the robot moved. In {results['walked_into']:,} "
+        "episodes something walked into a robot at rest.",
         f"The gate latched a stop in {sum(results['latched'].values()):,} episodes "
         f"({latched or 'none'}): such an episode ends at rest and still counts.",
-        f"One episode in {protocol.control_every}, and the first of each driver in each world, is "
-        "driven again without the gate, as a control.",
+        f"One episode in {protocol.control_every}, and the first of each driver in "
+        "each world, is repeated without the gate, as a control.",
         "Seeds, numbers and hashes were written to the JSON before the first episode.",
     ]
     faults = protocol.list_faults()
@@ -255,9 +256,9 @@ def _make_protocol(protocol: Protocol) -> Blocks:
     return [
         html.make_table(("what", "value"), rows),
         html.make_paragraph(
-            "The same run again. With these versions its episodes are the same bit for bit; faults "
-            "are injected in real time, and so at other moments:"
+            "To repeat the run. With these versions its episodes are bit-identical; "
+            "faults are injected in real time, hence at other times:"
         ),
         html.make_code(command),
-        html.make_details("The protocol as it was fixed", [html.make_code(text)]),
+        html.make_details("The predefined protocol", [html.make_code(text)]),
     ]

@@ -40,7 +40,7 @@ JUMP = 5.0
 JUMP_M = 0.2
 QUATERNION_TOLERANCE = 0.05
 LEAST_STEPS = 10
-# Window in which turns are compared if the robot was heard for a few seconds only
+# Window in which turns are compared if only a few seconds were received
 SHORT_WINDOW_S = 2.0
 UNITS = (
     (1000.0, "mm/s"),
@@ -102,12 +102,10 @@ def check_presence(facts: Facts, _: Expected) -> Findings:
             yield error("type", role, f"is of {' and '.join(types)}", fix)
         elif role == CMD_VEL:
             if facts.live and (ends is None or not ends.asks):
-                fix = (
-                    "start the base, or correct its namespace or the name of its topic"
-                )
-                yield error("missing topic", role, "nobody listens to it", fix)
+                fix = "start the base, or correct its namespace or its topic's name"
+                yield error("missing topic", role, "it has no subscriber", fix)
         elif role not in facts.heard:
-            what = "nothing was heard on it"
+            what = "no message was received"
             hint = ""
             if ends is None:
                 what = "there is no such topic"
@@ -138,13 +136,13 @@ def check_quality_of_service(facts: Facts, _: Expected) -> Findings:
             continue
         best_effort = any(not offer.reliable for offer in ends.offers)
         if role != CLOCK and best_effort and any(ask.reliable for ask in ends.asks):
-            what = "is sent best effort, and a subscriber asks for reliable: they never match"
-            fix = "let the publisher be reliable, or the subscriber best effort"
+            what = "is published best effort, but a subscriber requires reliable: they never match"
+            fix = "make the publisher reliable, or the subscriber best effort"
             yield no_match(role, what, fix)
         volatile = any(not offer.transient_local for offer in ends.offers)
         if volatile and any(ask.transient_local for ask in ends.asks):
-            what = "is sent volatile, and a subscriber asks for transient local: they never match"
-            yield no_match(role, what, "let both be volatile")
+            what = "is published volatile, a subscriber requires transient local: they never match"
+            yield no_match(role, what, "make both volatile")
 
 
 def check_publishers(facts: Facts, _: Expected) -> Findings:
@@ -152,8 +150,8 @@ def check_publishers(facts: Facts, _: Expected) -> Findings:
     for role in (CMD_VEL, ODOM, SCAN, CLOCK):
         ends = facts.topics.get(facts.names[role])
         if ends is not None and len(ends.offers) > 1:
-            what = f"has {len(ends.offers)} publishers, which overrule each other"
-            fix = "end all but one: joystick, navigation, a second simulator"
+            what = f"has {len(ends.offers)} publishers, which override each other"
+            fix = "stop all but one: joystick, navigation, a second simulator"
             yield error("publishers", role, what, fix)
 
 
@@ -189,7 +187,7 @@ def check_rates(facts: Facts, expected: Expected) -> Findings:
             fix = "set the driver's rate; on a slow network look for losses (best effort, Wi-Fi)"
             if role == SCAN:
                 fix += f", or set `rate: {rate:.3g}` in the lidar and generate the model again"
-            what = f"comes at {rate:.3g} Hz, expected {bound}{wanted:.3g} Hz"
+            what = f"arrives at {rate:.3g} Hz, expected {bound}{wanted:.3g} Hz"
             yield finding("rate", role, what, fix)
 
 
@@ -215,11 +213,11 @@ def check_latency(facts: Facts, _: Expected) -> Findings:
         missing = int((stamps == 0).sum())
         if missing:
             what = f"{missing} of {len(stamps)} messages are not stamped"
-            yield error("stamp", role, what, "let the driver stamp its messages")
+            yield error("stamp", role, what, "make the driver stamp its messages")
             continue
         back = int((np.diff(stamps) < 0).sum())
         if back:
-            what = f"{back} stamps are before the one before them"
+            what = f"{back} stamps are earlier than the previous one"
             fix = (
                 "look for a second publisher, or for a clock that is set while it runs"
             )
@@ -257,7 +255,7 @@ def check_clock(facts: Facts, _: Expected) -> Findings:
         return
     fix = "start the simulation or its clock, or set use_sim_time to false on all nodes"
     if heard is None:
-        yield error("clock", CLOCK, "has a publisher and says nothing", fix)
+        yield error("clock", CLOCK, "has a publisher but no messages", fix)
         return
     silent = (facts.end_ns - heard.arrivals_ns[-1]) * S_PER_NS
     if silent > STALE_CLOCK_S:
@@ -274,7 +272,7 @@ def check_motion(facts: Facts, expected: Expected) -> Findings:
     yield from _check_odometry(facts, expected.robot)
     ratio = _estimate_scale(facts)
     if ratio is not None and ratio < 0.0:
-        fix = "swap the wheels or turn the sign of angular.z: counter-clockwise is positive"
+        fix = "swap the wheels or invert the sign of angular.z: counter-clockwise is positive"
         yield error("command", CMD_VEL, "the robot turns against its commands", fix)
 
 
@@ -297,22 +295,23 @@ def check_turning(facts: Facts, expected: Expected) -> Findings:
     if turning is None:
         return
     if turning.mirrored:
-        fix = "turn the sign in the driver: the z axis points up, counter-clockwise is positive"
+        fix = "invert the sign in the driver: the z axis points up, counter-clockwise is positive"
         yield error("gyro", GYRO, "turns against odometry", fix)
     elif turning.in_degrees:
         what = f"turns {1.0 / turning.scale:.3g} times as far as odometry: degrees per second"
-        yield error("gyro", GYRO, what, "let the driver send radians per second")
+        yield error("gyro", GYRO, what, "make the driver send radians per second")
     elif not turning.plausible:
-        what = f"does not turn as odometry does (correlation {turning.alike:.2f})"
-        yield gyro_warning(what, "look at both while the robot turns on the spot")
+        what = f"does not turn like odometry (correlation {turning.alike:.2f})"
+        yield gyro_warning(what, "compare both while the robot turns on the spot")
     elif turning.contradicts and not expected.gyro:
         what = (
             f"contradicts odometry by {turning.apart:.2g} rad in {turning.window_s:g} s: odometry "
             f"turns {turning.scale:.2f} times as far"
         )
         fix = (
-            "trust the gyro where wheels slip: record it and generate the model again, which then "
-            "uses it; or give imu:=TOPIC to the nodes, --imu to nics evaluate"
+            "if wheels slip, trust the gyro: record it and generate the model again, "
+            "which then uses it; or give imu:=TOPIC to the nodes, --imu to nics "
+            "evaluate"
         )
         yield gyro_warning(what, fix)
 
@@ -346,11 +345,15 @@ def _check_odometry(facts: Facts, robot: RobotSpec) -> Findings:
     if not len(poses):
         return
     if not (np.isfinite(poses).all() and np.isfinite(twists).all()):
-        yield odometry_error("holds NaN or inf", "find out why its driver sends them")
+        yield odometry_error(
+            "contains NaN or inf", "find out why its driver sends them"
+        )
         return
     off = int((np.abs(length - 1.0) > QUATERNION_TOLERANCE).sum())
     if off:
-        what = f"{off} quaternions are not of length 1 but of up to {length.max():.3g}"
+        what = (
+            f"{off} quaternions have a length of up to {length.max():.3g} instead of 1"
+        )
         yield odometry_error(
             what, "send a quaternion, not a heading in its z, nor zeros"
         )
@@ -376,7 +379,7 @@ def _check_moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> F
     if jumps.sum() > 0.2 * going.sum():
         speed = float(np.median((far[going] / dt[going])[jumps[going]]))
         what = f"positions change by {speed:.0f} a second, the robot reaches {fastest:.2g} m/s"
-        yield odometry_error(what, "let positions be metres, not millimetres")
+        yield odometry_error(what, "give positions in metres, not millimetres")
         return
     if jumps.any():
         what = f"jumps {jumps.sum()} times, by up to {far[jumps].max():.2f} m"
@@ -409,24 +412,26 @@ def _compare_rates(
     if _is_alike(ratio):
         return
     if size == 0.0 or abs(real @ claimed) < ALIKE * size:
-        fix = "free the robot if it is stuck; else let both come from the same odometry"
+        fix = (
+            "free the robot if it is stuck; otherwise take both from the same odometry"
+        )
         yield odometry_warning(f"the pose does not follow twist.{field}", fix)
         return
-    what = f"twist.{field} is {ratio:.3g} times what the pose does"
-    fix = "let both come from the same odometry, the twist in the body's frame"
+    what = f"twist.{field} is {ratio:.3g} times the rate of the pose"
+    fix = "take both from the same odometry, the twist in the body's frame"
     if _is_alike(-ratio):
-        what = f"twist.{field} has the sign opposite to what the pose does"
-        fix = "turn the sign: forward and counter-clockwise are positive (REP-103)"
+        what = f"twist.{field} has the opposite sign of the rate of the pose"
+        fix = "invert the sign: forward and counter-clockwise are positive (REP-103)"
     for factor, name in units:
         if _is_alike(ratio / factor):
             what = f"{what}: {name}"
-            fix = f"let the twist be in {good}"
+            fix = f"give the twist in {good}"
             break
         if _is_alike(ratio * factor):
             what = (
                 f"the pose changes {1 / ratio:.3g} times as fast as twist.{field} says"
             )
-            fix = "let the pose be in metres and radians"
+            fix = "give the pose in metres and radians"
             break
     yield odometry_error(what, fix)
 
@@ -476,12 +481,12 @@ def check_layout(facts: Facts, expected: Expected) -> Findings:
             yield warning("beam layout", SCAN, what, "correct the driver's header")
         if layout.in_degrees:
             what = f"angles go from {header.angle_min:.4g} to {header.angle_max:.4g}: degrees"
-            yield error("unit", SCAN, what, "let the driver send radians")
+            yield error("unit", SCAN, what, "make the driver send radians")
         try:
             if expected.scan is not None:
                 doctor_facts.fit_lidar_to_header(layout, expected.lidar, expected.scan)
         except ConfigError as fault:
-            fix = "turn or set the lidar, or train a policy with what it sees"
+            fix = "turn or reconfigure the lidar, or train a policy with this view"
             yield layout_error(str(fault), fix)
         else:
             yield from _check_beams(layout, expected)
@@ -490,7 +495,7 @@ def check_layout(facts: Facts, expected: Expected) -> Findings:
 def _check_beams(layout: doctor_facts.Layout, expected: Expected) -> Findings:
     want = expected.lidar.header
     header = layout.header
-    fix = "set the driver, or make a lidar file of what it sends and generate the model again"
+    fix = "configure the driver, or describe its scan in a lidar file and generate the model again"
     if layout.beams != expected.lidar.beams:
         yield layout_error(
             f"has {layout.beams} beams, expected {expected.lidar.beams}", fix
@@ -498,8 +503,8 @@ def _check_beams(layout: doctor_facts.Layout, expected: Expected) -> Findings:
     off = max(abs(header.angle_min - want.angle_min), abs(layout.last - want.angle_max))
     if header.angle_increment < 0.0:
         if expected.scan is None and not layout.in_degrees:
-            what = "its beams go clockwise (angle_increment is negative)"
-            turn = "turn the order in the driver (`inverted`): they go counter-clockwise (REP-103)"
+            what = "its beams are clockwise (angle_increment is negative)"
+            turn = "reverse the order in the driver (`inverted`) to counter-clockwise (REP-103)"
             yield layout_error(what, turn)
     elif not layout.in_degrees and off > ANGLE_TOLERANCE * abs(want.angle_increment):
         wanted = f"{want.angle_min:.4f} to {want.angle_max:.4f}"
@@ -526,7 +531,7 @@ def check_ranges(facts: Facts, expected: Expected) -> Findings:
     beyond = finite > 1.001 * spec.range_max
     if len(finite) and np.median(finite) > 20.0 * spec.range_max:
         what = f"half of the ranges exceed {np.median(finite):.0f}: millimetres"
-        yield error("unit", SCAN, what, "let the driver send metres")
+        yield error("unit", SCAN, what, "make the driver send metres")
         return
     if len(finite) and beyond.mean() > ODD_FRACTION:
         what = f"{100 * beyond.mean():.0f} % of the ranges exceed range_max {spec.range_max:g} m"
@@ -549,4 +554,4 @@ def check_ranges(facts: Facts, expected: Expected) -> Findings:
         fix = (
             "correct the driver: too close is -inf (REP-117), nothing else is negative"
         )
-        yield convention("holds negative ranges", fix)
+        yield convention("contains negative ranges", fix)

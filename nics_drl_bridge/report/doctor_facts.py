@@ -178,7 +178,7 @@ def collect_facts_of_bag(
     if Path(path).exists() and not is_bag(path):
         advice = f"for another recording run `nics inspect {path}`"
         raise RecordingError(
-            f"{path}: is no bag; nics doctor checks bags and live robots; {advice}."
+            f"{path}: is not a bag; nics doctor checks bags and live robots; {advice}."
         )
     facts = Facts(str(path), False, names_in(namespace, imu))
     with open_bag(path) as bag:

@@ -1,4 +1,4 @@
-"""Blocks of a page on a fit: first the conclusion, then paths and yardsticks, then all figures."""
+"""Blocks of a page on a fit: conclusion, then paths and yardsticks, then all figures."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -54,12 +54,12 @@ def make_verdict_blocks(
         blocks.append(html.make_bullets(conclusion.doubts))
     if conclusion.gaps:
         blocks += [
-            html.make_paragraph("What the drive could not teach:"),
+            html.make_paragraph("Not learnt from the drive:"),
             html.make_bullets(conclusion.gaps),
         ]
     elif conclusion.verdict is Verdict.GOOD:
         blocks.append(
-            html.make_paragraph("The drive taught everything the model needs.")
+            html.make_paragraph("The drive shows everything the model needs.")
         )
     blocks.append(html.make_paragraph(conclusion.advice))
     return [*blocks, html.make_code("\n".join(commands))] if commands else blocks
@@ -68,7 +68,7 @@ def make_verdict_blocks(
 def make_path_blocks(identified: Identified) -> Blocks:
     """Compares predicted with measured paths, and the model's errors with the yardsticks'."""
     if identified.held_out is None or not identified.judgement:
-        return [html.make_paragraph("The drive is too short to hold data out.")]
+        return [html.make_paragraph("The drive is too short to hold out data.")]
     paths = fit_pictures.draw_held_out_paths(identified.trial)
     caption = "Mean prediction errors on unseen data: those of a good model lie below the others."
     if any(at.band_m for at in identified.judgement):
@@ -100,7 +100,7 @@ def _make_tiles(model: TaylorModel, conclusion: Conclusion) -> list[Tile]:
     gaps = len(conclusion.gaps)
     terms = f"terms of a model with a step of {model.dt:g} s"
     tiles = [
-        (str(gaps), "gaps in what the drive taught", not gaps),
+        (str(gaps), "gaps in the drive's data", not gaps),
         (str(model.terms_kept), terms, True),
     ]
     assumed = len(model.assumed)

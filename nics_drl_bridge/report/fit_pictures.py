@@ -49,8 +49,8 @@ CAPTIONS = {
     "accuracy": "Error against the number of terms; circles mark how many are kept.",
     "residuals": "Rates on unseen data, those of the model, and the residuals.",
     "alignment": "Commands as stamped and as they take effect, and the response of the robot.",
-    "inputs": "How motors change commands, over the range of the drive, and the rates that the "
-    "terms ask for.",
+    "inputs": "The effect of motors on commands, over the range of the drive, and on the "
+    "rates of the terms.",
 }
 
 
@@ -72,7 +72,7 @@ def fit_pictures(
 ) -> dict[str, bytes]:
     """Returns the pictures of a fit that the recording allows, as PNG by name."""
     pictures = {}
-    # Where predictions chose the terms, no curve did.
+    # There is no curve if the terms were chosen by predictions.
     if identified.findings.is_linear_fit:
         pictures["accuracy"] = draw_accuracy(identified)
     if paths and identified.held_out is not None:

@@ -76,7 +76,7 @@ class BagSource:
         return Frame(float(self._times[self._now]), (world,))
 
     def advance(self) -> bool:
-        """Moves on to the next frame; stays at the last one."""
+        """Advances to the next frame; stays at the last one."""
         self._now = min(self._now + 1, len(self._shots) - 1)
         return False
 

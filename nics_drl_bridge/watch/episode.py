@@ -174,7 +174,7 @@ class Lane:
         kept["_env"].close()
 
     def frame(self, place: int) -> WorldFrame:
-        """Returns the present frame; `place` is the place of the world's first member."""
+        """Returns the current frame; `place` is the index of the world's first member."""
         shot = self.env.snapshot()
         name = f"{self.world.name}, episode {self.seed}"
         return WorldFrame(
@@ -187,7 +187,7 @@ class Lane:
 
 
 def standing(env: BridgeEnv, *more: Obstacles, emptied: bool = False) -> World:
-    """Returns an env's world with `more` obstacles, and its own where they are unless `emptied`."""
+    """Returns an env's world with `more` obstacles, and its current ones unless `emptied`."""
     shot = env.snapshot()
     world = env.world.members[shot.member]
     shapes = env.world.shapes
@@ -311,7 +311,8 @@ class EpisodeSource:
         robot = self.model.robot
         if not self._drives:
             raise ConfigError(
-                f"robot {robot.name!r} takes no cmd_vel: no keyboard drives it."
+                f"robot {robot.name!r} takes no cmd_vel, so the keyboard can't drive "
+                "it."
             )
         fractions = np.clip(
             np.array(request.twist)[list(robot.cmd_vel_places)], -1.0, 1.0

@@ -11,7 +11,7 @@ from nics_drl_bridge.env.snapshot import Snapshot
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.exact_kernels import X, Y
 
-# maximum time between frames [s]: a mean over more says little about now
+# maximum time between frames for a meaningful velocity [s]
 LONGEST_S = 1.0
 FASTEST_M_S = 30.0  # anything faster was moved by hand or reset [m/s]
 

@@ -116,7 +116,7 @@ class PageServer:
         except OSError as error:
             reason = f"port {port} of {HOST} can't be served ({os.strerror(error.errno or 0)})"
             raise ConfigError(
-                f"{reason}; take another with --port, 0 for any."
+                f"{reason}; choose another with --port, or 0 for any."
             ) from None
         address = f"{HOST}:{self._server.socket.getsockname()[1]}"
         self.url = f"http://{address}/"
@@ -161,7 +161,7 @@ class PageServer:
             return None
 
     def _answer(self, connection: Any, request: Any) -> Any:
-        """Returns an HTTP response; None lets our page, or a program, open the socket."""
+        """Returns an HTTP response; None allows the page, or a program, to open the socket."""
         from websockets.datastructures import Headers
         from websockets.http11 import Response
 
@@ -178,7 +178,7 @@ class PageServer:
                 403, "This socket is open to its own page only.\n"
             )
         if request.path != "/":
-            return connection.respond(404, "There is the page / only.\n")
+            return connection.respond(404, "The only page is /.\n")
         body = files("nics_drl_bridge.watch").joinpath("page.html").read_bytes()
         about = {
             "Content-Type": "text/html; charset=utf-8",

@@ -29,10 +29,10 @@ class FrameSource(Protocol):
         """Returns everything that stays the same from frame to frame."""
 
     def frame(self) -> Frame:
-        """Returns the present frame."""
+        """Returns the current frame."""
 
     def advance(self) -> bool:
-        """Moves on to the next frame; returns True if the stage changed. Raises BridgeError."""
+        """Advances to the next frame; returns True if the stage changed. Raises BridgeError."""
 
     def take(self, request: Request) -> bool:
         """Handles a page's request; returns True if the stage changed. Raises BridgeError."""

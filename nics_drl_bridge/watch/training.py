@@ -25,7 +25,7 @@ class TrainingView:
         envs = training.envs
         worlds_per_env = max(1, MOST_WORLDS // len(envs))
         sizes = [len(env.world.members) for env in envs]
-        self._worlds = [  # each with the place of the first member of its world set
+        self._worlds = [  # each with the index of the first member of its world set
             (env, n, sum(sizes[:k]), Track())
             for k, env in enumerate(envs[:MOST_WORLDS])
             for n in range(min(worlds_per_env, env.num_envs))

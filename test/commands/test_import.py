@@ -40,7 +40,7 @@ def test_a_log_becomes_a_mapping_a_recording_and_a_model(folder, tmp_path):
     assert "\nnot used: battery_volts\n" in done.stdout
     assert "# guessed" in (tmp_path / "my.yaml").read_text()
     again = nics("inspect", folder / "drive.csv", "--map my.yaml", cwd=tmp_path)
-    assert "is there already" in again.stderr
+    assert "already exists" in again.stderr
 
     words = ("import", folder / "drive.csv", "--map", "my.yaml", "--out")
     done = nics(*words, "drive.npz", cwd=tmp_path)

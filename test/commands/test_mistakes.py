@@ -46,7 +46,7 @@ FILES = {
     "kind.yaml": "name: mine\nkind: diferential\nfootprint_radius: 0.2\n",
     "far.yaml": ROBOT.replace("min: 0.0, max: 1.0", "min: 0.0, max: 0.01"),
     "settings.yaml": "tsak: navigation\n",
-    "stop.jsonl": "no black box\n",
+    "stop.jsonl": "not a black box\n",
     "paced.yaml": "robot: differential\nworlds: {circles: 4}\ntask_options: {top_speed: 0.5 m/s}\n",
     "shapeless.yaml": "name: mine\nkind: differential\nfootprint: wide\n",
     "units.yaml": "robot: differential\npose: {x: x, y: x, heading: x, unit: [m, m, rad]}\n",
@@ -79,17 +79,17 @@ MISTAKES = {
     "train --model ./nowhere": "./nowhere: no such folder",
     "train --robot taken": "taken: holds no model.yaml",
     "train --settings nowhere.yaml": "--settings nowhere.yaml: no such file",
-    "train --seeds 1 1": "none twice",
+    "train --seeds 1 1": "without duplicates",
     f"train --seeds {2**64}": "seed 18446744073709551616: must be",
     f"evaluate straight --in fast --seed {2**63}": "seed|'--seed'",
     "train --out mine.py": "--out mine.py: is a file, not a folder",
     "train --watch --engine ray": "worlds of other processes are not shown",
     "record --out d.txt": "unknown kind of recording '.txt'",
-    "record --out drive.npz": "is there already",
+    "record --out drive.npz": "already exists",
     "record --out d.npz --preview --remap odom=x": "--remap 'odom=x': must be NAME:=OTHER",
     "demo --recording empty --out d": "empty",
-    "watch --ros --bag drive": "--bag does not go with --ros; leave out --bag, or --ros",
-    "watch straight --bag drive": "a policy does not go with --bag",
+    "watch --ros --bag drive": "--bag can't be combined with --ros; leave out --bag, or --ros",
+    "watch straight --bag drive": "a policy can't be combined with --bag",
     "watch --record a.avi": "--record 'a.avi': ",
     "watch --bag nowhere --world arena --world room": "a robot is in one",
     "evaluate diferential": "unknown policy 'diferential'; did you mean 'differential'?",
@@ -120,19 +120,19 @@ MISTAKES = {
     # Files that are not there, or are something else.
     "generate nothing.npz --out m": "nothing.npz: no such file",
     "generate torn.npz --out m": "torn.npz",
-    "generate drive.npz --out m --topic odom=/odom": "is no bag",
+    "generate drive.npz --out m --topic odom=/odom": "is not a bag",
     "generate table.csv --map good.yaml --topic pose=/p --out m": "name the topics in the map",
     "generate empty.csv --out m": "empty.csv",
     "generate table.csv --out m": "table.csv: .*map",
-    "inspect table.csv --map begun.yaml": "is there already; give another name",
+    "inspect table.csv --map begun.yaml": "already exists; give another name",
     "import table.csv --map begun.yaml --out d.csv": "must end in .npz",
     "explain nothing.jsonl": "no such file",
     "explain stop.jsonl": "stop.jsonl: is no JSON, line by line",
     "generate drive.npz drive.npz --out m": "drive.npz: is given twice; give each recording once",
     "generate drive.npz --robot robot/model.yaml --out robot": "robot/model.yaml: is not what this",
     "policy export differential --leapp robot/model": "robot/model/model.yaml: is not what this",
-    "doctor drive.npz": "drive.npz: is no bag; nics doctor checks bags and live robots",
-    "evaluate differential --shadow table.csv": "table.csv: is no bag; a bag is the folder",
+    "doctor drive.npz": "drive.npz: is not a bag; nics doctor checks bags and live robots",
+    "evaluate differential --shadow table.csv": "table.csv: is not a bag; a bag is the folder",
     "policy import text.txt --robot differential --out p.bin": "a policy file ends with '.onnx'",
     "world draw clutter --out clutter.jpg": "must end in .png",
     "drive --robot differential --out m --recording d.csv": "must end in .npz",
@@ -245,7 +245,7 @@ def test_an_option_without_its_partner_or_with_a_foe_is_refused(
     with pytest.raises(typer.Exit):
         console.check_options(function)(**dict.fromkeys(given, "x"))
     sentence = capsys.readouterr().err
-    words = "belongs to" if rule == "NEEDED" else "does not go with"
+    words = "belongs to" if rule == "NEEDED" else "can't be combined with"
     assert words in sentence
     assert console._format_option(partners[0]) in sentence
 

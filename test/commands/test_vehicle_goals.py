@@ -99,7 +99,7 @@ def test_a_far_goal_that_nobody_can_confirm_is_refused_in_one_sentence(monkeypat
     far = GoalOrder((20.0, 0.0), start="present").episode(SCENE)
     for confirm in (None, vehicle_goals.confirm_at_terminal):
         with pytest.raises(
-            ConfigError, match=r"20.00 m ahead.*farther than 5 m.*say --yes"
+            ConfigError, match=r"20.00 m ahead.*farther than 5 m.*use --yes"
         ):
             far.confirm(confirm)
 

@@ -93,7 +93,7 @@ def test_several_files_go_to_a_folder_all_or_none(tmp_path):
     words = "import a.world b.sdf"
     assert "is for one file, not for 2" in refused(words, "--name x", cwd=tmp_path)
     assert "--out x.yaml: is for one" in refused(words, "--out x.yaml", cwd=tmp_path)
-    assert "all/a.yaml: is there already" in refused(words, "--out all", cwd=tmp_path)
+    assert "all/a.yaml: already exists" in refused(words, "--out all", cwd=tmp_path)
     sdf(tmp_path, DISC, name="a.sdf")
     assert "two files would be" in refused("import a.world a.sdf", cwd=tmp_path)
 

@@ -126,9 +126,9 @@ def test_every_flipped_bit_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("", "is no black box"),
-        ("{}", "is no black box"),
-        ("{", "is no JSON"),
+        ("", "is not a black box"),
+        ("{}", "is not a black box"),
+        ("{", "is not JSON"),
         (f'{{"format": "{FORMAT}"}}', "is damaged"),
         (f'{{"format": "{FORMAT}", "config": {{"kind": "Spy"}}}}', "is damaged"),
     ],
@@ -191,7 +191,7 @@ def test_very_many_records_or_brackets_are_refused_at_once(tmp_path):
     path = tmp_path / "stop.jsonl"
     for text, words in (
         ("[" * 3_000_000, "holds 3000000 values"),
-        ("[" * 5000, "no JSON"),
+        ("[" * 5000, "not JSON"),
     ):
         path.write_text(text)
         with pytest.raises(ConfigError, match=words):

@@ -191,9 +191,7 @@ def test_wheels_tell_latency_from_clock_offset_and_whether_they_are_swapped(
 
 
 def test_a_recording_of_another_robot_is_refused(car, mecanum):
-    with pytest.raises(
-        RecordingError, match="check that the recording is of this robot"
-    ):
+    with pytest.raises(RecordingError, match="check that this robot was recorded"):
         calibrate(drive(car, duration=5.0), mecanum)
 
 

@@ -98,7 +98,7 @@ def test_repeated_rows_are_left_out_and_change_nothing(car):
     }
     plain = identify(once, car)
     twice = identify(Recording(**again), car)
-    assert said(twice, "repeat the row before them")
+    assert said(twice, "repeat the previous row")
     assert twice.model.named.terms == plain.model.named.terms
 
 

@@ -32,7 +32,7 @@ CAUSES = {
     "a command is frozen": "[Nn]o command ever changed|no command changed|never (moved|changed)",
     "the pose jumps": "pose: jumps|its pose jumps",
     "the pose has a gap": "has a gap of|more gaps",
-    "rows are repeated": "repeat the row before them",
+    "rows are repeated": "repeat the previous row",
     "two values": "only two values",
     "the drive is too short": "too short|too few|longer than these|record a longer drive",
     "nobody knows": "does not show why|record again|60 s or longer",

@@ -39,7 +39,7 @@ def test_a_gate_that_is_told_nothing_requires_an_emergency_stop(declared):
         ({"scan_age": 0.05}, "parameter 'scan_age': 0.05 s: scan comes every 0.1 s"),
         ({"odom_age": 0.02}, "parameter 'odom_age'"),
         ({"odom_rate": 50.0, "odom_age": 0.01}, "give more than 0.02"),
-        ({"odom_rate": 0.5, "odom_age": 5.0}, "too seldom"),
+        ({"odom_rate": 0.5, "odom_age": 5.0}, "too rarely"),
         ({"estimate_std": 0.5}, "'estimate_position' .* and 'estimate_heading'"),
         ({"model": "ackermann", "limits": "mecanum"}, "limits are for 'mecanum', not"),
     ],

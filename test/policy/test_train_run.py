@@ -98,7 +98,7 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
         (["--robot", "diferential"], "did you mean 'differential'"),
         (["--resume"], "--resume needs --out"),
         (["--resume", "--out", "nowhere"], "nowhere: contains no settings.yaml"),
-        (["--seeds", "1", "1", "--out", "run"], "give one or more, none twice"),
+        (["--seeds", "1", "1", "--out", "run"], "give one or more, without duplicates"),
         (["--engine", "rai"], "unknown engine 'rai'; did you mean 'ray'"),
         (
             ["--engine", "lean", "--algorithm", "sac"],

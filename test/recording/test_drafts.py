@@ -488,7 +488,7 @@ def test_a_bag_without_commands_is_told_what_it_lacks(shared_recordings):
     assert draft["pose"] == "/husky_velocity_controller/odom"
     robot = load_robot("differential")
     with pytest.raises(
-        RecordingError, match="a model learns from what was sent to the robot"
+        RecordingError, match="a model learns from the robot's commands"
     ):
         read_recording(bag, robot)
 

@@ -125,7 +125,7 @@ def test_a_folder_that_lacks_a_file_names_those_that_are_needed(folder, file):
         ("nowhere.npz", "no such file"),
         (
             "cmd.csv",
-            "is neither a bag nor a folder with cmd.csv .* nor an .npz file; say what is",
+            "is neither a bag nor a folder with cmd.csv .* nor an .npz file; describe its",
         ),
     ],
 )

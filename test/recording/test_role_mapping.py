@@ -210,7 +210,7 @@ def test_a_bag_without_a_robot_is_refused(tmp_path):
 
 def test_topics_for_what_is_no_bag_are_refused(tmp_path):
     (tmp_path / "drive.npz").write_bytes(b"")
-    with pytest.raises(RecordingError, match="leave out --topics and --topic"):
+    with pytest.raises(RecordingError, match="remove --topics and --topic"):
         read_recording(tmp_path / "drive.npz", CAR, TopicRoles(pose="/pose"))
 
 

@@ -82,7 +82,7 @@ def test_a_column_of_parquet_that_holds_no_numbers_is_let_be(tmp_path, columns, 
 def test_a_folder_without_tables_and_a_path_that_is_none_are_refused(tmp_path):
     (tmp_path / "notes.md").write_text("none")
     for path, sentence in (
-        (tmp_path, "holds no file of a known"),
+        (tmp_path, "contains no file of a known"),
         (tmp_path / "x", "no such"),
     ):
         with pytest.raises(RecordingError, match=sentence), open_source(path):

@@ -138,7 +138,7 @@ def test_a_recorder_that_stalled_is_forgiven():
 @pytest.mark.parametrize("rate", [0.5, 2.0])
 def test_a_simulated_time_at_another_rate_is_refused(rate):
     sentence = refused({"command": COMMAND, "pose": topic("/pose", rate * T, start=0)})
-    assert "of a simulated time at another rate" in sentence
+    assert "from a simulated time at another rate" in sentence
     assert "--use-sim-time" in sentence
 
 

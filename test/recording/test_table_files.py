@@ -101,7 +101,7 @@ def test_a_row_that_was_cut_short_is_left_out_and_told(tmp_path):
             "t,x\n" + "0,1\n" * 9 + "0\n1,2,3\n",
             "line 11 has 1 fields where most lines have 2",
         ),
-        ("speed,angle\nfast,left\n", "holds no row of numbers"),
+        ("speed,angle\nfast,left\n", "contains no row of numbers"),
         ("0,1\n" + "2" * 30_000, "line 2 has 30000 characters"),
         ("0,1\0\n", "is not text"),
     ],

@@ -54,7 +54,7 @@ def test_every_stream_comes_back_on_its_clock(tmp_path, name, storage):
 
 def test_a_folder_that_is_there_is_left_alone(tmp_path):
     (tmp_path / "bag").mkdir()
-    with pytest.raises(RecordingError, match="is there already"):
+    with pytest.raises(RecordingError, match="already exists"):
         write_bag(Recording(stream(2), stream(3)), tmp_path / "bag", CAR)
     assert os.listdir(tmp_path / "bag") == []
 
@@ -85,7 +85,7 @@ def test_a_drive_comes_back_from_a_file_and_from_a_bag(tmp_path, name):
 
 def test_a_place_that_is_taken_or_of_no_kind_is_refused(tmp_path):
     (tmp_path / "drive.npz").write_text("mine")
-    with pytest.raises(ConfigError, match=r"drive.npz: is there already"):
+    with pytest.raises(ConfigError, match=r"drive.npz: already exists"):
         check_out(tmp_path / "drive.npz")
     with pytest.raises(
         ConfigError, match=r"drive.csv: unknown kind of recording '.csv'"

@@ -151,9 +151,9 @@ def test_a_clock_that_does_not_go_on_is_named(ticks, said):
             "/cmd_vel",
             {"offers": (BEST_EFFORT,)},
             "quality of service",
-            "asks for reliable",
+            "requires reliable",
         ),
-        ("/cmd_vel", {"asks": ()}, "missing topic", "nobody listens"),
+        ("/cmd_vel", {"asks": ()}, "missing topic", "has no subscriber"),
         (
             "/odom",
             {"asks": (Offer(transient_local=True),)},
@@ -253,11 +253,11 @@ def test_a_scan_that_does_not_fit_is_named(changed, check, said):
         ("odom", {"frames": ("odom", "robot")}, "frame", "child_frame_id"),
         ("odom", {"frames": ("/odom", "base_link")}, "frame", "slash"),
         ("odom", {"speed": 1000.0}, "odometry", "mm/s"),
-        ("odom", {"speed": -1.0}, "odometry", "linear.x has the sign opposite"),
+        ("odom", {"speed": -1.0}, "odometry", "linear.x has the opposite sign"),
         ("odom", {"turn": 180.0 / np.pi}, "odometry", "degrees per second"),
-        ("odom", {"turn": -1.0}, "odometry", "angular.z has the sign opposite"),
+        ("odom", {"turn": -1.0}, "odometry", "angular.z has the opposite sign"),
         ("odom", {"pose": 1000.0}, "odometry", "millimetres"),
-        ("odom", {"pose": 2.0}, "odometry", "times what the pose does"),
+        ("odom", {"pose": 2.0}, "odometry", "times the rate of the pose"),
         ("odom", {"covariance": 0.0}, "odometry", "covariance of zeros"),
         ("odom", {"jump": 3.0}, "odometry", "jumps 1 times, by up to 3.0"),
         ("odom", {"stamped": False}, "stamp", "400 of 400 messages are not stamped"),
@@ -348,4 +348,4 @@ def test_a_bag_is_judged_like_the_robot_and_its_gyro_is_found_by_type(tmp_path):
     assert examine(collect_facts_of_bag(bag, imu="none"), EXPECTED) == []
     rows["/odom"] = [(t + 0.002, message) for t, message in odometries(turn=-1.0)]
     bad = bags.write(tmp_path / "bad", rows)
-    assert "sign opposite" in only(collect_facts_of_bag(bad, imu="none")).what
+    assert "opposite sign" in only(collect_facts_of_bag(bad, imu="none")).what

@@ -179,7 +179,7 @@ class BagRecorder(BridgeNode):
         if len(kinds) > 1 or kind is None:
             why = f"is of {kinds[0]}, whose package is not installed; install it to record it"
             if len(kinds) > 1:
-                why = f"has publishers of {' and '.join(kinds)}; end those of the wrong type"
+                why = f"has publishers of {' and '.join(kinds)}; stop those of the wrong type"
             self.skipped[topic] = f"{topic} {why}."
             self._say(f"not recorded: {self.skipped[topic]}")
             return
@@ -231,7 +231,7 @@ def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
             fix = "start the robot, or correct --topics, --namespace or ROS_DOMAIN_ID."
             fix += f" Not recorded: {skipped}" if skipped else ""
             raise BackendError(
-                f"nothing was heard on any topic, so no bag is written; {fix}"
+                f"no topic had any messages, so no bag was written; {fix}"
             )
     return sink.counts
 
@@ -382,7 +382,7 @@ def play_bag(
         ]
         timed.sort(key=lambda one: one[:2])
         if not timed:
-            raise RecordingError(f"{path}: holds nothing that can be played here.")
+            raise RecordingError(f"{path}: contains nothing that can be played here.")
         player.ready()
         sent = player.play(timed)
         while loop and not stopping.is_set():

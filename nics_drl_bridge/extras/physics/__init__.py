@@ -1,1 +1,1 @@
-"""What robots on wheels with contact have in common, whichever physics engine moves them."""
+"""Common parts of wheeled robots with contact, for any physics engine."""

@@ -215,7 +215,7 @@ class PhysicsSimulator(DrivenSimulator, ABC):
         """Builds the scene with obstacles (K, 7), and returns the rigs of robots to be placed."""
 
     def refresh(self) -> None:
-        """Derives what depends on the robots' poses, after they were placed."""
+        """Updates derived values after the robots were placed."""
 
     @abstractmethod
     def place_obstacles(self, bodies: Array) -> None:
@@ -248,7 +248,7 @@ class PhysicsSimulator(DrivenSimulator, ABC):
         self._resume(motions)
 
     def put_robot(self, robot: int, pose: Array, state: Array) -> None:
-        """Puts a robot, see `FastSimulator.put_robot`; the motors bring its wheels up to speed."""
+        """Places a robot, see `FastSimulator.put_robot`; the motors accelerate its wheels."""
         super().put_robot(robot, pose, state)
         rig = self._rigs[robot]
         rig.put(pose)

@@ -1,1 +1,1 @@
-"""Evidence for a gate: episodes that try to make it fail, driven by a protocol fixed beforehand."""
+"""Evidence for a gate: episodes that try to make it fail, by a predefined protocol."""

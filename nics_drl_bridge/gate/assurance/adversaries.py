@@ -21,14 +21,14 @@ ADVERSARIES = {
     "late": "keeps away, then turns into the nearest thing",
     "jerk": "jerks between the ends of its commands",
 }
-HORIZONS_S = (0.3, 1.0)  # times ahead at which commands are compared
-TRIES = 12  # commands of each sort that are compared
-GRAZE_M = 0.01  # depth to which the grazing adversary wants to touch
+HORIZONS_S = (0.3, 1.0)  # look-ahead times at which commands are compared
+TRIES = 12  # number of commands of each type that are compared
+GRAZE_M = 0.01  # overlap at which the grazing adversary aims
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Everything about a robot and its surroundings."""
+    """True state of a robot and its surroundings."""
 
     pose: Array  # (3,) of the robot
     twist: Array  # (3,) of the robot
@@ -40,7 +40,7 @@ class Truth:
 
 
 class Driver(Protocol):
-    """Decides what the robot is commanded."""
+    """Decides on the robot's commands."""
 
     def act(self, truth: Truth) -> Array:
         """Returns the command (C,)."""
@@ -85,7 +85,7 @@ class Adversary:
         return self._held
 
     def _find_clearance(self, truth: Truth, commands: Array) -> Array:
-        """Returns the least clearances (n,) [m] to which commands (n, C) lead."""
+        """Returns the minimum clearances (n,) [m] to which commands (n, C) lead."""
         twist = compute_steady_twist(self._robot, commands)
         horizons = np.array(HORIZONS_S)
         moved = geometry.exp(np.multiply.outer(horizons, twist))
@@ -102,7 +102,7 @@ class Adversary:
 
 
 class PolicyDriver:
-    """A policy on its way to its goal."""
+    """A policy that drives to its goal."""
 
     def __init__(self, policy: str, model: SimulatorModel) -> None:
         self._policy, self._task = open_policy(policy, model)

@@ -1,4 +1,4 @@
-"""Episodes behind a gate in process: the delays are those of a robot, but drawn."""
+"""Episodes behind a gate in process, with randomly drawn realistic delays."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -15,16 +15,17 @@ from nics_drl_bridge.gate.stopping import make_gate_config, shield_config
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 
-# greatest delay of a scan to the gate, and of the command after it [s]
+# maximum delay of a scan to the gate, and of the command after it [s]
 MAX_SCAN_DELAY_S = 0.29
-# greatest delay of the gate's command to the base, the gate's own pauses included [s]
+# maximum delay of the gate's command to the base, including the gate's own pauses [s]
 MAX_COMMAND_DELAY_S = 0.1
-# This fraction of the data is late by up to the most that the episode has, the rest by a fifth.
+# This fraction of the data is late by up to the episode's maximum, the rest by up to a
+# fifth of it.
 HURRIED = 0.25
 
 
 class Delays:
-    """Draws how late data arrive; nothing overtakes what was sent before."""
+    """Draws the delays of data; later data never overtake earlier ones."""
 
     def __init__(self, rng: np.random.Generator, max_steps: float) -> None:
         self._rng = rng
@@ -45,7 +46,7 @@ def configure_gate(
     overrides: Mapping[str, float] | None = None,
     shielded: bool = True,
 ) -> GateConfig:
-    """Returns the gate as `command_gate` sets it up; `overrides` are values of the shield."""
+    """Returns the configuration that `command_gate` uses; `overrides` are shield values."""
     command_limits = load_limits(limits, model.robot)
     shield = None
     if shielded:
@@ -63,7 +64,7 @@ def configure_gate(
 def drive(
     place: Place, config: GateConfig | None, job: Job, witness: Witness | None = None
 ) -> Outcome:
-    """Drives an episode with a gate of its own, or without one if `config` is None.
+    """Drives an episode with its own gate, or without one if `config` is None.
 
     Without a gate, commands go to the base, and the witness sees them as decisions.
     """

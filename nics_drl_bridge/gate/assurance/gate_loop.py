@@ -1,4 +1,4 @@
-"""A gate in process, on a clock that its owner holds."""
+"""A gate in process, on a clock that its owner controls."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ from nics_drl_bridge.gate.state import Decision, GateConfig, begin
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.spec import LidarSpec
 
-Witness = Callable[[Decision, float], None]  # sees a decision and its time [s]
+Witness = Callable[[Decision, float], None]  # receives each decision and its time [s]
 START_S = 1000.0
 SETTLE_PERIODS = 12  # scans before arming
 
@@ -47,13 +47,13 @@ class Gate:
         return self.give(Command(self.stamp_ns, twist))
 
     def tick(self) -> Decision:
-        """Lets the gate's clock tick."""
+        """Advances the gate's clock by a tick."""
         return self.give(Tick())
 
     def arm(self, ranges: NDArray[np.float32], pose: Array) -> None:
-        """Lets the robot stand still until the gate can be armed, and arms it.
+        """Keeps the robot at rest until the gate can be armed, and arms it.
 
-        Raises BackendError if it can't be.
+        Raises BackendError if it can't be armed.
         """
         self.give(Reset())
         for _ in range(SETTLE_PERIODS):

@@ -1,6 +1,6 @@
-"""Compares what a gate publishes with its limits, by code of its own.
+"""Compares what a gate publishes with its limits, with independent code.
 
-Which decisions brake or stop, and may change faster, is taken from the gate's own word.
+The gate itself reports which decisions brake or stop and may therefore change faster.
 """
 
 import numpy as np
@@ -18,13 +18,13 @@ TOLERANCE = 1e-6
 class LimitJudge:
     """Counts how often each limit is exceeded, by finite differences.
 
-    Braking, by the shield or to a stop, may be as hard as it needs to be. Without `slopes`, only
-    values are judged.
+    Braking, by the shield or to a stop, has no limit. Without `slopes`, only values are
+    judged.
     """
 
     def __init__(self, robot: RobotSpec, limits: Limits, slopes: bool = True) -> None:
         self.limits = limits
-        self.sane = True  # the newest command makes sense, so a motion may follow
+        self.sane = True  # the newest command is plausible, so a motion may follow
         self.violations = dict.fromkeys(VIOLATIONS, 0)
         self._robot = robot
         self._slopes = slopes

@@ -1,7 +1,7 @@
-"""A robot in a world of its own, what happens to it there, and who drives it.
+"""A robot in its own world, with its driver and what happens to it.
 
-The world moves in short steps. The robot's base reads a command once per control period, as a slow
-one does.
+The world advances in short steps. The robot's base reads a command once per control
+period, like a slow real one.
 """
 
 from dataclasses import dataclass, replace
@@ -24,9 +24,10 @@ from nics_drl_bridge.sim.world import load_world
 
 STEP_S = 0.02  # about the time between two steps of the world
 ADVERSARY_S = 5.0  # length of an adversary's episode
-POLICY_S = 25.0  # greatest length of a policy's episode
-# A robot that moved more slowly than this, over so many steps before a touch, stood and was walked
-# into [m/s]. At rest the noise of a car shakes it by up to 0.012 m/s.
+POLICY_S = 25.0  # maximum length of a policy's episode
+# A robot that moved more slowly than this over the last steps before a touch was at
+# rest and was walked into [m/s]. At rest, the noise of a car moves it at up to 0.012
+# m/s.
 MOVING = 0.02
 MOVING_STEPS = 10
 POLICY = "policy"
@@ -38,11 +39,11 @@ class Job:
 
     kind: str  # of its driver: one of `ADVERSARIES`, or `policy`
     seed: int  # of scene and driver
-    standing: bool = False  # the driver only stands
+    standing: bool = False  # the driver never moves
 
     @property
     def longest_s(self) -> float:
-        """Greatest length."""
+        """Maximum length [s]."""
         return POLICY_S if self.kind == POLICY else ADVERSARY_S
 
 
@@ -54,19 +55,19 @@ class Outcome:
     robot: str
     world: str
     seed: int
-    contact: bool = False  # the robot moved when it touched something
-    walked_into: bool = False  # it stood when something touched it
+    contact: bool = False  # the robot touched something while it moved
+    walked_into: bool = False  # something touched it while it was at rest
     latched: str = ""  # rule by which the gate latched a stop
-    reached: bool = False  # it came to its goal
+    reached: bool = False  # it reached its goal
     path: float = 0.0  # [m]
     seconds: float = 0.0
-    speed: float = 0.0  # at the touch, if any [m/s]
-    silence: float = 0.0  # longest time for which its gate said nothing, over DDS [s]
+    speed: float = 0.0  # speed at the contact, if any [m/s]
+    silence: float = 0.0  # longest silence of its gate over DDS [s]
     position: tuple[float, float] = (0.0, 0.0)  # at the end [m]
 
 
 class Place:
-    """A robot in a world, for one episode after the other; a model's lidar scans once a period."""
+    """A robot in a world, for consecutive episodes; its lidar scans once per period."""
 
     def __init__(
         self,
@@ -78,8 +79,8 @@ class Place:
         if model.sensors:
             names = ", ".join(sensor.name for sensor in model.sensors)
             raise ConfigError(
-                f"robot {model.robot.name!r} has further sensors ({names}), which these episodes "
-                "do not simulate; use a model without them."
+                f"robot {model.robot.name!r} has additional sensors ({names}), which "
+                "these episodes do not simulate; use a model without them."
             )
         timing = model.timing
         divisors = [
@@ -100,13 +101,13 @@ class Place:
         self._sim = FastSimulator(
             replace(self.model, control_period=self.step_s),
             opened,
-            renderer="auto",  # right also beside an obstacle
+            renderer="auto",  # also correct close to an obstacle
             randomisation=randomisation,
         )
-        self.odom = np.zeros(3)  # pose by odometry, from one episode to the next
+        self.odom = np.zeros(3)  # pose by odometry, continued over episodes
 
     def begin(self, job: Job) -> None:
-        """Places the robot in the scene of a job; it stands. `track` gets its true poses (3,)."""
+        """Places the robot at rest in the scene of a job. `track` gets its true poses (3,)."""
         self.job = job
         self._steps = 0
         self.scenes = self._sim.reset([job.seed])
@@ -128,7 +129,7 @@ class Place:
 
     @property
     def truth(self) -> Truth:
-        """Everything about the robot and its surroundings now."""
+        """Returns the true state of the robot and its surroundings."""
         data = self._sim.data
         obstacles = self._sim.obstacles[0]
         return Truth(
@@ -142,13 +143,13 @@ class Place:
         )
 
     def wish(self, truth: Truth) -> Array:
-        """Returns what the driver sends to `cmd_vel_raw` (3,)."""
+        """Returns the driver's command for `cmd_vel_raw` (3,)."""
         if self.job.standing:
             return np.zeros(3)
         return self.model.robot.to_cmd_vel(self._driver.act(truth))
 
     def step(self, twist: Array) -> None:
-        """Moves on by a step while `cmd_vel` is `twist` (3,)."""
+        """Advances by a step while `cmd_vel` is `twist` (3,)."""
         data = self._sim.data
         outcome = self.outcome
         if (self._steps + self._phase) % self.period_steps == 0:
@@ -163,7 +164,7 @@ class Place:
         outcome.seconds = self._steps * self.step_s
         outcome.position = (x, y)
         if data.collided[0, 0] and not touched:
-            # The touch itself may have stopped the robot.
+            # The contact itself may have stopped the robot.
             outcome.speed = max(before, self._compute_speed())
             outcome.contact = outcome.speed > MOVING
             outcome.walked_into = not outcome.contact
@@ -171,9 +172,10 @@ class Place:
         self.odom = geometry.compose(self._anchor, moved)
 
     def _compute_speed(self) -> float:
-        """Returns the true speed over the last steps; that of odometry is noisy [m/s].
+        """Returns the true speed over the last steps [m/s], since odometry is noisy.
 
-        It is that of the centre or, if it is greater, that of a corner about the centre.
+        It is the speed of the centre, or that of a corner about the centre if that is
+        higher.
         """
         lately = self.track[-MOVING_STEPS - 1 :]
         steps = len(lately) - 1
@@ -182,7 +184,7 @@ class Place:
         x, y, turn = geometry.between(lately[0], lately[-1])
         distance = float(np.hypot(x, y))
         robot = self.model.robot
-        if robot.footprint is not None:  # a circle that turns sweeps nothing
+        if robot.footprint is not None:  # a turning circle sweeps nothing
             distance = max(distance, abs(float(turn)) * robot.footprint_radius)
         return distance / (steps * self.step_s)
 

@@ -18,19 +18,21 @@ CLAIMS = {
     LIMITS: "What the base is told keeps the limits of value, rate and jerk.",
     TOUCHES: "The robot touches nothing while it moves.",
 }
-# A car's angle follows from its turn rate only while it moves, so only its values are judged.
+# A car's steering angle follows from its turn rate only in motion, so only values are
+# judged.
 CLAIMS_BY_TURN_RATE = CLAIMS | {
     LIMITS: "What the base is told keeps the limits of value."
 }
 KINDS = (*ADVERSARIES, POLICY)
 NO_GATE = "no_gate"  # the control: commands go past the gate
-# Each kind of driver in each world begins with a control; then one episode in so many has one. It
-# shares no factor with the number of kinds, so that all of them have controls.
+# Each kind of driver in each world begins with a control; after that, every so many
+# episodes have one. The number has no common factor with the number of kinds, so that
+# all kinds have controls.
 CONTROL_EVERY = 47
 
 
 def choose_claims(robot: RobotSpec) -> Mapping[str, str]:
-    """Returns the claims that can be judged of a robot."""
+    """Returns the claims that can be judged for a robot."""
     return CLAIMS_BY_TURN_RATE if robot.takes_turn_rate else CLAIMS
 
 
@@ -45,7 +47,7 @@ class Trial(NamedTuple):
 
 @dataclass(frozen=True)
 class Protocol:
-    """Everything that fixes a run."""
+    """Everything that determines a run."""
 
     policy: str  # a file, or the name of a shipped one
     limits: str
@@ -61,7 +63,7 @@ class Protocol:
     fault_kinds: tuple[str, ...] = ()
     fault_controls: tuple[
         str, ...
-    ] = ()  # those that are injected without the gate, too
+    ] = ()  # faults that are also injected without the gate
     claims: Mapping[str, str] = field(default_factory=lambda: CLAIMS)
     drivers: tuple[str, ...] = KINDS
     control_every: int = CONTROL_EVERY
@@ -81,7 +83,7 @@ class Protocol:
         return hash_bytes(format_json(self.data).encode())
 
     def list_trials(self) -> Iterator[Trial]:
-        """Yields all episodes, each control after the episode that it repeats."""
+        """Yields all episodes; each control follows the episode that it repeats."""
         first = len(KINDS) * len(self.worlds)
         for index in range(self.episodes):
             kind = KINDS[index % len(KINDS)]
@@ -118,14 +120,15 @@ class Protocol:
         )
 
     def check_same(self, written: Any, folder: str) -> None:
-        """Raises ConfigError, with the first difference, unless another run had this protocol."""
+        """Raises ConfigError with the first difference from the protocol of an earlier run."""
         ours = _flatten(self.data)
         theirs = _flatten(written)
         for name in (*ours, *theirs):
             if ours.get(name) != theirs.get(name):
                 raise ConfigError(
-                    f"{folder}: a run with another protocol is there: {name!r} was "
-                    f"{theirs.get(name)!r} and is {ours.get(name)!r} now; choose another --out."
+                    f"{folder}: contains a run with another protocol: {name!r} was "
+                    f"{theirs.get(name)!r} and is now {ours.get(name)!r}; choose "
+                    "another --out."
                 )
 
 

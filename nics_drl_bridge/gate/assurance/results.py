@@ -1,4 +1,4 @@
-"""What the episodes and faults of a run show: counts with bounds, and failures in clusters."""
+"""Results of the episodes and faults of a run: rates with bounds, and clusters of failures."""
 
 import math
 from collections import Counter, defaultdict
@@ -24,7 +24,7 @@ FAILED: dict[str, Callable[[Row], bool]] = {
 
 
 def summarise(rows: Sequence[Row], faults: int = 0) -> dict[str, Any]:
-    """Returns the results of a run's rows, of which so many should be faults, as plain data."""
+    """Returns the results of a run's rows as plain data; `faults` of them should be faults."""
     tried = [row for row in rows if row["gated"]]
     controls = [row for row in rows if not row["gated"]]
     episodes = [row for row in tried if "fault" not in row]
@@ -46,7 +46,7 @@ def summarise(rows: Sequence[Row], faults: int = 0) -> dict[str, Any]:
 def _count_touches(
     tried: Sequence[Row], controls: Sequence[Row]
 ) -> dict[str, list[int]]:
-    """Returns, by driver, touches and episodes with the gate, then both without it."""
+    """Returns, by driver, contacts and episodes with the gate, then both without it."""
     counts: dict[str, list[int]] = {}
     for kind in KINDS:
         counts[kind] = []

@@ -1,4 +1,4 @@
-"""A run of a protocol, which goes on where it was interrupted, and the log of its episodes."""
+"""A resumable run of a protocol, and the log of its episodes."""
 
 import json
 import os
@@ -21,7 +21,7 @@ RESULT = "assurance.json"
 LOG = "episodes.jsonl"
 FAULT_LOG = "faults.jsonl"
 Row = dict[str, Any]  # a trial in a log, with its outcome
-Tell = Callable[[int, int], None]  # trials that are done, and all
+Tell = Callable[[int, int], None]  # numbers of finished and of all trials
 
 
 class Run:
@@ -36,7 +36,7 @@ class Run:
         configure_gate(model, protocol.limits)
 
     def open_place(self, world: str, kind: str) -> Place:
-        """Returns the place of an episode; only those of the policy are randomised."""
+        """Returns the place of an episode; only the policy's are randomised."""
         is_policy = kind == POLICY
         if (world, is_policy) not in self._places:
             randomisation = self.protocol.randomisation if is_policy else None
@@ -58,7 +58,7 @@ class Run:
 
 
 def begin(folder: Path, protocol: Protocol) -> None:
-    """Writes the protocol, or checks that it is that of the run that is there."""
+    """Writes the protocol, or checks it against that of the existing run."""
     file = folder / RESULT
     if file.exists():
         protocol.check_same(read_result(folder)["protocol"], str(folder))
@@ -91,7 +91,7 @@ def read_result(folder: Path) -> dict[str, Any]:
             return dict(data)
     except (ValueError, KeyError, TypeError):
         pass
-    raise ConfigError(f"{file}: is no result of nics assure; choose another --out.")
+    raise ConfigError(f"{file}: is not a result of nics assure; choose another --out.")
 
 
 def drive_all(
@@ -100,9 +100,9 @@ def drive_all(
     drive_rest: Callable[[list[Trial]], Iterable[Row]],
     tell: Tell,
 ) -> list[Row]:
-    """Drives what a log lacks, and returns its rows in order. Raises ConfigError for another log.
+    """Drives the trials missing from a log; returns all rows in order. May raise ConfigError.
 
-    A trial that gives no row is tried again by the next run.
+    A trial without a row is repeated by the next run.
     """
     log.touch()
     with log.open("r+b") as file:
@@ -124,7 +124,7 @@ def drive_all(
 
 
 def read_rows(log: Path, trials: list[Trial]) -> tuple[list[Row], int]:
-    """Returns the whole rows of a log and their size [bytes]."""
+    """Returns the complete rows of a log and their size [bytes]."""
     *lines, _ = log.read_bytes().split(b"\n")
     rows = list(_parse(log, lines, trials))
     return rows, sum(len(line) + 1 for line in lines)
@@ -138,7 +138,8 @@ def _parse(log: Path, lines: list[bytes], trials: list[Trial]) -> Iterator[Row]:
             left.remove(_read_trial(row))
         except (ValueError, KeyError, TypeError):
             raise ConfigError(
-                f"{log}: line {number} is no episode of this run; choose another --out."
+                f"{log}: line {number} is not an episode of this run; choose another "
+                "--out."
             ) from None
         yield row
 

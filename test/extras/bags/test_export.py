@@ -37,7 +37,7 @@ def drive(duration=3.0, beams=6):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--mcap", "{full}"), "is there already"),
+        (("--mcap", "{full}"), "already exists"),
         (("--mcap", "{new}", "--model", "nobody"), "nobody"),
     ],
 )

@@ -64,5 +64,5 @@ def test_a_robot_with_further_sensors_is_refused():
     model = builtin_model("differential")
     rear = model.lidar.model_copy(update={"frame": "rear"})
     sensors = (FurtherLidar(name="rear_scan", lidar=rear),)
-    with pytest.raises(ConfigError, match=r"further sensors \(rear_scan\)"):
+    with pytest.raises(ConfigError, match=r"additional sensors \(rear_scan\)"):
         Place(replace(model, sensors=sensors), "arena")

@@ -33,7 +33,9 @@ def test_a_line_that_a_killed_run_left_unfinished_is_dropped(tmp_path):
 def test_a_log_of_other_episodes_is_refused_by_its_line(tmp_path, lines, number):
     log = tmp_path / runs.LOG
     log.write_bytes(b"".join(lines))
-    with pytest.raises(ConfigError, match=f"line {number} is no episode of this run"):
+    with pytest.raises(
+        ConfigError, match=f"line {number} is not an episode of this run"
+    ):
         runs.read_rows(log, TRIALS)
 
 
@@ -62,7 +64,7 @@ def test_a_log_that_another_run_writes_is_refused(tmp_path):
     log = tmp_path / runs.LOG
 
     def drive_twice(trials):
-        with pytest.raises(ConfigError, match="another process writes it"):
+        with pytest.raises(ConfigError, match="another process is writing it"):
             runs.drive_all(log, TRIALS, iter, lambda *_: None)
         return iter([])
 
@@ -89,5 +91,5 @@ def test_a_log_without_its_protocol_is_refused(tmp_path, log):
 @pytest.mark.parametrize("text", ["", "{}", '{"format": "other", "protocol": {}}', "3"])
 def test_another_json_file_is_no_result(tmp_path, text):
     (tmp_path / runs.RESULT).write_text(text)
-    with pytest.raises(ConfigError, match="is no result of nics assure"):
+    with pytest.raises(ConfigError, match="is not a result of nics assure"):
         runs.begin(tmp_path, PROTOCOL)
