@@ -83,7 +83,8 @@ def bound_rate(failures: int, trials: int) -> tuple[float, float]:
     """Returns the 95 % bounds of a rate by Clopper and Pearson (1934).
 
     Without failures the upper bound is one-sided, about 3 / trials; a two-sided one would be 3.7 /
-    trials. Since the data choose between the two, at least 92.5 % holds for both together.
+    trials. Since the data decide which of the two is used, the joint confidence is at
+    least 92.5 %.
     """
     if trials == 0:
         return 0.0, 1.0
