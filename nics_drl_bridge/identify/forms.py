@@ -9,7 +9,6 @@ from functools import lru_cache
 from itertools import product
 
 import numpy as np
-import scipy  # its parts load slowly, when used
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
@@ -20,6 +19,7 @@ from nics_drl_bridge.identify.open_loop import MIDDLE_OF_STEP, roll
 from nics_drl_bridge.identify.signals import (
     average_effect,
     find_speed_index,
+    lag_behind,
     list_followed_commands,
     select_moved_commands,
     select_moved_inputs,
@@ -120,9 +120,9 @@ def _fit_curve(
         least = np.inf
         for lag in LAGS_S:
             columns = [np.ones(len(speed))]
-            share = 1.0 - np.exp(-samples.dt / lag)
+            kept = float(np.exp(-samples.dt / lag))
             for u in effect.T:
-                low = scipy.signal.lfilter([share], [1.0, share - 1.0], u)
+                low = lag_behind(np.append(u, 0.0), 0.0, kept)[1:]
                 columns += [low] if dof == 0 else [low, low * speed]
             chi = np.stack(columns, axis=1)[::stride]
             rest = target - chi @ np.linalg.lstsq(chi, target, rcond=None)[0]

@@ -419,6 +419,8 @@ def find_input_curves(drive: Drive, findings: Findings) -> Findings:
         curves.append(candidate.curve)
         if candidate.gain >= CLEAR:
             clear.append(candidate.curve)
+    if not curves:
+        return findings
     calibration = replace(findings.calibration, inputs=tuple(curves))
     findings = replace(findings, calibration=calibration, clear_curves=tuple(clear))
     return _with_likely_latency(findings)  # the curves may hide a part of it

@@ -1,6 +1,7 @@
 """Compiled rollouts over windows: poses at their ends, and derivatives by the coefficients.
 
-`shoot` rolls out a model with its sensitivities, `roll_windows` a textbook.
+`shoot` rolls out a model with its sensitivities, `roll_windows` a textbook. `follow_first_order`
+serves states that follow commands, since `scipy.signal` takes a second to import.
 """
 
 import math
@@ -340,6 +341,13 @@ def _hold(
     unheld -= math.copysign(dt * bounds.friction, unheld)
     if moved != unheld:
         slope[:] = 0.0
+
+
+@kernel
+def follow_first_order(states: Array, targets: Array, kept: float) -> None:
+    """Writes states (T,) after the first: each keeps a share of its distance from the target."""
+    for k in range(len(states) - 1):
+        states[k + 1] = targets[k] + kept * (states[k] - targets[k])
 
 
 class BicycleGeometry(NamedTuple):

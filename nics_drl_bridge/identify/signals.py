@@ -17,6 +17,7 @@ import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify.kernels import follow_first_order
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.curve import InputCurve, apply_curves, delays
@@ -150,10 +151,15 @@ def infer_states(
     initial = average_held(command, spec, at_rest, at_rest + 1.0)[0, follows]
     states = np.empty((len(grid), len(follows)))
     for i, kept in enumerate(np.exp(-dt / np.maximum(lags, SHORTEST_LAG_S))):
-        # x[k + 1] = kept * x[k] + (1 - kept) * target[k]
-        lag = ([0.0, 1.0 - kept], [1.0, -kept])
-        begin = initial[i : i + 1]
-        states[:, i] = scipy.signal.lfilter(*lag, targets[:, i], zi=begin)[0]
+        states[:, i] = lag_behind(targets[:, i], float(initial[i]), float(kept))
+    return states
+
+
+def lag_behind(targets: Array, begin: float, kept: float) -> Array:
+    """Returns states (T,), at first `begin`, that keep a share of their distance from targets."""
+    states = np.empty(len(targets))
+    states[0] = begin
+    follow_first_order(states, np.ascontiguousarray(targets), kept)
     return states
 
 

@@ -17,7 +17,7 @@ from nics_drl_bridge.identify.kernels import STRAIGHT, BicycleGeometry, roll_win
 from nics_drl_bridge.identify.motion import choose_half_width, measure_body_twists
 from nics_drl_bridge.identify.open_loop import Windows, select_windows
 from nics_drl_bridge.identify.shooting import HEADING_ARM_M
-from nics_drl_bridge.identify.signals import average_held, unwrap_headings
+from nics_drl_bridge.identify.signals import average_held, lag_behind, unwrap_headings
 from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread
@@ -155,10 +155,8 @@ def _predict_ends(response: TextbookResponse, course: _Course, twist: Array) -> 
             [np.sign(target[:, 0]) * more, 0.0 * more, target[:, 2]], axis=1
         )
         target[:, 2] += response.offset[2]
-        share = 1.0 - np.exp(-STEP_S / response.lag_s[2])
-        angle = target[:, 2]
-        lag = [0.0, share], [1.0, share - 1.0]
-        angle = scipy.signal.lfilter(*lag, angle, zi=angle[:1])[0]
+        kept = float(np.exp(-STEP_S / response.lag_s[2]))
+        angle = lag_behind(target[:, 2], float(target[0, 2]), kept)
         actuator[:, 1] = 0.0
         actuator[:, 2] = np.interp(begin / STEP_S, np.arange(len(angle)), angle)
         if bicycle.front_drive:
