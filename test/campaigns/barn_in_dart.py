@@ -8,6 +8,7 @@ package ships.
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -99,9 +100,17 @@ def measure(given: Given) -> Result:
     }
 
 
+def print_to_stderr() -> None:
+    """Sends what DART prints about a file to the standard error of this process."""
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+
+
 def read_all(jobs: list[Job]) -> Iterator[Comparison]:
     """Yields the comparisons of all jobs, in their order."""
-    with ProcessPoolExecutor(AT_ONCE, mp_context=get_context("spawn")) as pool:
+    pool = ProcessPoolExecutor(
+        AT_ONCE, mp_context=get_context("spawn"), initializer=print_to_stderr
+    )
+    with pool:
         for job, compared in zip(jobs, pool.map(read_twice, jobs), strict=True):
             sys.stderr.write(f"world {job.number}: {compared}\n")
             yield compared

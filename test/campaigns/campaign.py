@@ -408,7 +408,7 @@ CAMPAIGNS: dict[str, Campaign] = {
             "ice": Control(
                 "the grip of the tyres: the floor of the engines is ice",
                 "points of success apart",
-                "--episodes 10 --robots differential --engines fast,dart",
+                "--episodes 3 --robots differential --engines fast,dart",
             ),
         },
         ("mujoco", "dartpy"),
