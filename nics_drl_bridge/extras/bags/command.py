@@ -93,7 +93,6 @@ def info(
     )
 
 
-@bag.command()
 def _replay_estimator(
     path: Path, model: str, roles: list[str], out: Path | None, as_json: bool
 ) -> None:
@@ -113,6 +112,7 @@ def _replay_estimator(
     console.print_line(as_json, line, **facts, sha256=estimates.digest)
 
 
+@bag.command()
 def replay(
     path: BagArgument,
     rate: Annotated[
