@@ -211,3 +211,10 @@ def test_a_setting_with_which_the_gate_is_never_armed_is_refused(changes, words)
         return
     with pytest.raises(ConfigError, match=words):
         require_possible(given)
+
+
+@pytest.mark.parametrize("topic", ["scan", "odom"])
+def test_an_age_of_exactly_one_period_is_refused(topic):
+    """Any message that is a little late would stop the robot."""
+    with pytest.raises(ConfigError, match=f"'{topic}_age'.*give more than 0.1"):
+        require_possible(config(**{f"{topic}_age_s": 0.1}))
