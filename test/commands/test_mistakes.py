@@ -152,7 +152,7 @@ MISTAKES = {
     "evaluate differential --hardware --confirm-beyond -1": "'--confirm-beyond': ",
     "bag record out --storage mcp": "'--storage': .*'mcp'.*'mcap'",
     "evaluate differential ackermann": "evaluate them one by one",
-    "doctor --model differential --policy differential": "give one of them",
+    "doctor --model differential --policy differential": "give only one",
     "doctor --namespace a/-b": "namespace 'a/-b': must be words of letters, digits and _",
     "evaluate differential --goal 2,1 --in fast": "--goal: requires --hardware or --shadow; add",
     # Numbers that are none.
