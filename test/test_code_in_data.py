@@ -386,9 +386,6 @@ def test_a_run_of_a_task_of_ones_own_is_resumed_where_the_caller_names_it(trap):
     place = f"{trap.file}:Trap"
     run_of_a_task(trap, place)
     done = nics("train", "--resume", "--out", "run", cwd=trap.folder)
-    assert (
-        "is a program, which a data file must not start; name it yourself"
-        in done.stderr
-    )
+    assert "is code, which a data file must not run; name it yourself" in done.stderr
     done = nics("train", "--resume", "--out", "run", "--task", place, cwd=trap.folder)
     assert "run: contains no checkpoint of these seeds" in done.stderr

@@ -177,7 +177,7 @@ def test_a_value_is_what_it_looks_like(text):
         ("name: 12", "name", "not 12"),
         ("name: a\nspare: [1, 2]", "spare", "`key: value` pairs, not [1, 2]."),
         ("name: a\nextras: [1, 2]", "extras", "`key: value` pairs, not [1, 2]."),
-        ("name: a\nwheels: 6", "wheels", "must be a list, as [a, b], not 6."),
+        ("name: a\nwheels: 6", "wheels", "must be a list such as [a, b], not 6."),
         ("name: a\nsize: [6]", "size", "must be more than 1."),
         ("name: a\nsize: [6, 4, 2]", "size", "must be at most 2, not 3."),
         *(

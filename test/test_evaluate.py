@@ -85,7 +85,7 @@ def test_an_evaluation_in_the_folder_of_another_says_that_it_replaces_it(tmp_pat
     first, second = (nics(words, cwd=tmp_path) for _ in range(2))
     assert (first.returncode, second.returncode) == (0, 0)
     assert "replaced" not in first.stderr
-    assert "out: the evaluation.json that is there will be replaced" in second.stderr
+    assert "out: the existing evaluation.json will be replaced" in second.stderr
 
 
 @pytest.mark.slow

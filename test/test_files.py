@@ -298,7 +298,7 @@ def test_where_folders_can_not_change_places_a_failure_leaves_the_old_one(
 @pytest.mark.parametrize(
     ("name", "content", "reason"),
     [
-        ("thesis.tex", "years of work", r"holds other files and no 'model\.yaml'"),
+        ("thesis.tex", "years of work", r"contains other files but no 'model\.yaml'"),
         (MARKER, "name: mine", "was not written by this command"),
     ],
 )
@@ -334,7 +334,7 @@ def test_what_is_no_file_to_read_is_named(listed, name, what):
     if what == "large":
         with path.open("wb") as file:
             file.truncate(MOST_BYTES + 1)
-    with pytest.raises(ModelError, match=f"{name}: is (missing, or no|larger than)"):
+    with pytest.raises(ModelError, match=f"{name}: is (missing, or not a|larger than)"):
         check_sums(listed, NAMES)
 
 

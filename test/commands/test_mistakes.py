@@ -77,7 +77,7 @@ MISTAKES = {
     "train --task nowhere.py:Mine": "'nowhere.py': no such file",
     "train --task mine.py": "defines no subclass",
     "train --model ./nowhere": "./nowhere: no such folder",
-    "train --robot taken": "taken: holds no model.yaml",
+    "train --robot taken": "taken: contains no model.yaml",
     "train --settings nowhere.yaml": "--settings nowhere.yaml: no such file",
     "train --seeds 1 1": "without duplicates",
     f"train --seeds {2**64}": "seed 18446744073709551616: must be",
@@ -88,7 +88,7 @@ MISTAKES = {
     "record --out drive.npz": "already exists",
     "record --out d.npz --preview --remap odom=x": "--remap 'odom=x': must be NAME:=OTHER",
     "demo --recording empty --out d": "empty",
-    "watch --ros --bag drive": "--bag can't be combined with --ros; leave out --bag, or --ros",
+    "watch --ros --bag drive": "--bag can't be combined with --ros; remove --bag or --ros",
     "watch straight --bag drive": "a policy can't be combined with --bag",
     "watch --record a.avi": "--record 'a.avi': ",
     "watch --bag nowhere --world arena --world room": "a robot is in one",
@@ -104,12 +104,12 @@ MISTAKES = {
     "drive --robot misspelt.yaml --out m": "parameter 'wheel_radius'; is 'wheel_radus' it?",
     "drive --robot turned.yaml --out m": "turned.yaml: .*min",
     "drive --robot with_unit.yaml --out m": "key 'footprint_radius': .*'0.15 m'",
-    "drive --robot twice.yaml --out m": "the key 'footprint_radius' stands twice; keep one",
+    "drive --robot twice.yaml --out m": "the key 'footprint_radius' occurs twice; keep one",
     "drive --robot listed.yaml --out m": "the top level must be `key: value` lines",
     "drive --robot kind.yaml --out m": "there is no 'diferential'; did you mean 'differential'?",
     "train --settings settings.yaml": "unknown key 'tsak'; did you mean 'task'",
     "train --settings paced.yaml": "task option top_speed='0.5 m/s': must be a finite number",
-    "drive --robot shapeless.yaml --out m": "key 'footprint': must be a list, as .*'wide'",
+    "drive --robot shapeless.yaml --out m": "key 'footprint': must be a list such as .*'wide'",
     "import table.csv --map units.yaml --out d.npz": "is no known unit .*not \\['m', 'm', 'rad'\\]",
     "import table.csv --map number.yaml --out d.npz": "pose.unit.*must be one of m, dm, .*not 1",
     "generate drive.npz --out m --order five": "order is 'five'; it must be 1, 2, 3 or 4",
@@ -127,10 +127,10 @@ MISTAKES = {
     "inspect table.csv --map begun.yaml": "already exists; give another name",
     "import table.csv --map begun.yaml --out d.csv": "must end in .npz",
     "explain nothing.jsonl": "no such file",
-    "explain stop.jsonl": "stop.jsonl: is no JSON, line by line",
-    "generate drive.npz drive.npz --out m": "drive.npz: is given twice; give each recording once",
-    "generate drive.npz --robot robot/model.yaml --out robot": "robot/model.yaml: is not what this",
-    "policy export differential --leapp robot/model": "robot/model/model.yaml: is not what this",
+    "explain stop.jsonl": "stop.jsonl: is not JSON, line by line",
+    "generate drive.npz drive.npz --out m": "drive.npz: is given twice; name each recording once",
+    "generate drive.npz --robot robot/model.yaml --out robot": "robot/model.yaml: was not written",
+    "policy export differential --leapp robot/model": "robot/model/model.yaml: was not written",
     "doctor drive.npz": "drive.npz: is not a bag; nics doctor checks bags and live robots",
     "evaluate differential --shadow table.csv": "table.csv: is not a bag; a bag is the folder",
     "policy import text.txt --robot differential --out p.bin": "a policy file ends with '.onnx'",
@@ -143,7 +143,7 @@ MISTAKES = {
     "train --robot differential --out run": "run: contains a run with other settings",
     "train --resume": "--resume needs --out",
     "train --resume --out taken": "taken: contains no settings.yaml; name the folder of a run",
-    "bag replay bag --out d.npz": "--out: belongs to --estimate; add that, or leave it out",
+    "bag replay bag --out d.npz": "--out: requires --estimate; add it, or remove this",
     "train --address auto": "belongs to --engine ray",
     "evaluate differential --backend dds": "--backend dds drives the vehicle: add --hardware",
     "evaluate differential --hardware --goal 2": "--goal",
@@ -152,9 +152,9 @@ MISTAKES = {
     "evaluate differential --hardware --confirm-beyond -1": "'--confirm-beyond': ",
     "bag record out --storage mcp": "'--storage': .*'mcp'.*'mcap'",
     "evaluate differential ackermann": "evaluate them one by one",
-    "doctor --model differential --policy differential": "give one of them",
+    "doctor --model differential --policy differential": "give only one",
     "doctor --namespace a/-b": "namespace 'a/-b': must be words of letters, digits and _",
-    "evaluate differential --goal 2,1 --in fast": "--goal: belongs to --hardware or --shadow; add",
+    "evaluate differential --goal 2,1 --in fast": "--goal: requires --hardware or --shadow; add",
     # Numbers that are none.
     "drive --robot differential --out m --duration nan": "--duration.*(finite|should)",
     "bag replay bag --rate nan": "--rate.*(must be a finite number|Input should be)",
@@ -245,7 +245,7 @@ def test_an_option_without_its_partner_or_with_a_foe_is_refused(
     with pytest.raises(typer.Exit):
         console.check_options(function)(**dict.fromkeys(given, "x"))
     sentence = capsys.readouterr().err
-    words = "belongs to" if rule == "NEEDED" else "can't be combined with"
+    words = "requires" if rule == "NEEDED" else "can't be combined with"
     assert words in sentence
     assert console._format_option(partners[0]) in sentence
 

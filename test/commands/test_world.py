@@ -154,7 +154,9 @@ def test_a_world_of_too_many_bodies_is_refused_by_the_file_that_holds_them(
     monkeypatch.setattr(config, "MAX_VALUES", 1000)
     boxes = [f"<box><size>{0.1 + 1e-5 * k:.5f} 0.1 1</size></box>" for k in range(200)]
     many = refused("import", sdf(tmp_path, *boxes), "--out made.yaml", cwd=tmp_path)
-    assert many.startswith("my.world: its 200 bodies make a larger file than is read; ")
+    assert many.startswith(
+        "my.world: its 200 bodies make a file that is too large to be read; "
+    )
     assert not (tmp_path / "made.yaml").exists()
 
 

@@ -198,7 +198,7 @@ def test_a_robot_that_no_shield_fits_may_drive_without_one():
         ({"scan_age_s": 0.09}, "'scan_age'.*give more than 0.1"),
         ({"odom_age_s": 0.09}, "'odom_age': 0.09 s"),
         ({"scan_rate": 2.0}, "scan comes every 0.5 s"),
-        ({"odom_rate": 1.5, "odom_age_s": 2.0}, "too seldom to be judged within 1 s"),
+        ({"odom_rate": 1.5, "odom_age_s": 2.0}, "too rarely to be judged within 1 s"),
     ],
 )
 def test_a_setting_with_which_the_gate_is_never_armed_is_refused(changes, words):

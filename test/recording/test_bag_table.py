@@ -99,7 +99,7 @@ def test_types_that_only_the_bag_knows_are_read_by_field_index_and_flag(tmp_path
     assert np.allclose(found.command.values[:, 0], np.where(t > 1.0, 2.0 * t, 0.0))
     assert np.allclose(found.command.values[:, 1], t)
     for command, sentence in (
-        ("/drive:motor", "say which, as 'motor[0]'"),
+        ("/drive:motor", "choose one, such as 'motor[0]'"),
         ("/drive:moter[1]", "did you mean 'motor[1]'?"),
         ("/driv:motor[1]", "did you mean '/drive'?"),
     ):

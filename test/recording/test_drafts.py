@@ -288,7 +288,7 @@ def test_wheels_that_stand_in_leave_other_candidates_as_comments(tmp_path):
     text, draft = drafted(write(tmp_path / "log.csv", columns))
     assert draft["command"].keys() == {"left_wheel", "right_wheel"}
     assert "no command was recorded" not in text
-    assert "none is certain: what the wheels did stands in for it" in text
+    assert "none is certain: the measured wheel motion is used instead" in text
     assert "#  or forward_command: v\n#  or turn_command: w\n" in text
 
 
@@ -508,5 +508,5 @@ def test_what_names_do_not_show_of_a_real_recording_is_blank_or_in_doubt(
         "right_wheel": {"from": "Right_Tick", "unit": "ticks"},
     }
     assert text.count("guessed; add `ticks_per_turn:`") == 2
-    assert "no command was recorded: what the wheels did stands in for it" in text
+    assert "no command was recorded: the measured wheel motion is used instead" in text
     assert "\n#  or " not in text

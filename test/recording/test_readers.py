@@ -82,13 +82,13 @@ def test_wheels_and_acceleration_may_be_missing(folder):
             "cmd.csv",
             3,
             "0.1,inf,0.4",
-            "cmd.csv: line 3: column '1' is infinite; mend or remove",
+            "cmd.csv: line 3: column '1' is infinite; correct or remove",
         ),
         (
             "cmd.csv",
             7,
             "0.1,fast,0.4",
-            "line 7: column '1' is 'fast', which is no number; mend",
+            "line 7: column '1' is 'fast', which is not a number; correct",
         ),
         (
             "vrpn.csv",

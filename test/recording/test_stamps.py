@@ -50,7 +50,7 @@ def test_a_stamp_that_fits_none_beside_it_is_left_out(row, value):
     made, rows, note = stamping.repair_order(t, "log")
     assert np.array_equal(made, np.delete(T, row))
     assert row not in rows
-    assert f"1 stamps fit none beside them (row {row}: {value:.10g} s)" in note
+    assert f"1 stamps do not fit their neighbours (row {row}: {value:.10g} s)" in note
 
 
 def test_rows_that_begin_with_the_last_are_turned_round():

@@ -116,9 +116,9 @@ def test_what_is_no_table_is_refused(tmp_path, text, sentence):
     ("which", "sentence"),
     [
         ("tme", "has no column 'tme'; did you mean 'time'?"),
-        ("x", "2 columns are called 'x'; give the number of the one you mean: 1 or 2."),
+        ("x", "2 columns are called 'x'; choose one by number: 1 or 2."),
         (7, "has no column 7; its columns are 0 to 3."),
-        ("word", "line 3: column 'word' is 'oops', which is no number"),
+        ("word", "line 3: column 'word' is 'oops', which is not a number"),
     ],
 )
 def test_a_column_that_is_not_there_is_named(tmp_path, which, sentence):

@@ -82,9 +82,9 @@ def test_several_topics_for_a_role_are_listed_with_what_to_write():
         "/b/cmd_vel (geometry_msgs/msg/TwistStamped), /cmd_vel (geometry_msgs"
         in sentence
     )
-    assert sentence.endswith("say which with --topic cmd_vel=/b/cmd_vel.")
+    assert sentence.endswith("choose one with --topic cmd_vel=/b/cmd_vel.")
     sentence = refused(USUAL | {"/imu": kinds.IMU})
-    assert sentence.endswith("say which with --topic imu=/imu, or imu=none for none.")
+    assert sentence.endswith("choose one with --topic imu=/imu, or imu=none for none.")
 
 
 def test_without_poses_the_topics_are_listed_with_their_types():

@@ -180,7 +180,9 @@ def test_ends_of_a_topic_that_do_not_fit_are_named(topic, ends, check, said):
 def test_a_table_is_no_damaged_bag(tmp_path):
     table = tmp_path / "drive.csv"
     table.write_text("t,x,y,yaw\n0,0,0,0\n")
-    with pytest.raises(RecordingError, match=r"drive\.csv: is no bag; .*`nics inspect"):
+    with pytest.raises(
+        RecordingError, match=r"drive\.csv: is not a bag; .*`nics inspect"
+    ):
         collect_facts_of_bag(table)
 
 

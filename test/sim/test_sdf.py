@@ -219,7 +219,7 @@ def test_the_ground_is_nothing_to_run_into(write):
         (f"<model name='a'>{model(MESH, 'b')}</model>", "model 'a::b' has a mesh"),
         (
             "<actor name='walker'/>",
-            "model 'walker' has an actor, which moves by a script",
+            "model 'walker' has an actor, which follows a script",
         ),
         ("<population name='cans'/>", "model 'cans' has a population of models"),
         (
@@ -289,7 +289,7 @@ CYCLE = (
         (model(POINT), "needs at least three different points"),
         (
             model(FINE),
-            "collision 'c': <polyline> has 20000 points, a shape at most 16384; coarsen",
+            "collision 'c': <polyline> has 20000 points; the maximum is 16384; simplify",
         ),
         (
             model(FAR),
