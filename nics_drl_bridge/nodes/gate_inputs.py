@@ -27,7 +27,7 @@ def read_scan(lidar: LidarSpec, content: bytes) -> inputs.Scan:
 
 
 def read_sensor(sensor: Sensor, content: bytes) -> inputs.SensorReading:
-    """Read a serialised message of a further sensor."""
+    """Read a serialised message of an additional sensor."""
     points = sensor.points(sensor_from_ros(sensor, content))
     return inputs.SensorReading(wire.read_stamp(content), sensor.name, points)
 

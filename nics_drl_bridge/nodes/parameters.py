@@ -645,7 +645,7 @@ DRIVEN_BY = (
 TOLD = (
     "scan",
     "odom",
-    "the model's further sensors",
+    "the model's additional sensors",
     "joint_states",
     "ground_truth",
     "map",
@@ -657,7 +657,7 @@ SERVED = ("~/reset", "~/pause", "~/repeat", "~/self_test", "~/touched")
 HEARD = (
     "scan",
     "odom",
-    "the model's further sensors",
+    "the model's additional sensors",
     "cmd_vel",
     "pose (with pose_type)",
     "imu (or the topic that the parameter names)",
@@ -729,7 +729,7 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
             "odom",
             "odometry/filtered",
             "e_stop",
-            "the model's further sensors",
+            "the model's additional sensors",
         ),
         ("cmd_vel", "/diagnostics"),
         ("~/arm", "~/reset", "~/e_stop"),

@@ -144,7 +144,7 @@ def advance(
         for m in range(robots):
             if meets[m] != FREE:
                 if motions[m].safe_until <= time + tolerance:
-                    _judge(m, begin, time, duration - time, world)
+                    _choose_motion(m, begin, time, duration - time, world)
                 end = min(end, motions[m].safe_until)
         if obstacles_move:
             place_obstacles(begin + end, world)
@@ -228,7 +228,7 @@ def start_motion(
     motion.bound = _bound_speed(body, vx, vy, turn, world)
     motion.is_close = False
     motion.freedom = MOVE
-    _turn_off(motion, body, 0.0, vx, vy, turn)
+    _change_twist(motion, body, 0.0, vx, vy, turn)
 
 
 @kernel
@@ -243,7 +243,7 @@ def _bound_speed(
 
 
 @kernel
-def _turn_off(
+def _change_twist(
     motion: Record,
     body: Array,
     time: float,
@@ -325,7 +325,9 @@ def _find_approach(time: float, touch: Record, world: ContactWorld) -> float:
 
 
 @kernel
-def _judge(m: int, begin: float, time: float, rest: float, world: ContactWorld) -> None:
+def _choose_motion(
+    m: int, begin: float, time: float, rest: float, world: ContactWorld
+) -> None:
     """Choose a robot's further motion, and the time until it may touch something."""
     motion = world.tight.motions[m]
     fastest = world.tight.fastest[0]
@@ -412,13 +414,15 @@ def _deflect(m: int, time: float, world: ContactWorld) -> None:
         if is_done:
             break
     if is_bent:
-        _turn_off(motion, body, time, c * vx + s * vy, c * vy - s * vx, turn)
+        _change_twist(motion, body, time, c * vx + s * vy, c * vy - s * vx, turn)
     elif (
         motion.vx != motion.wish_x
         or motion.vy != motion.wish_y
         or motion.turn != motion.wish_turn
     ):
-        _turn_off(motion, body, time, motion.wish_x, motion.wish_y, motion.wish_turn)
+        _change_twist(
+            motion, body, time, motion.wish_x, motion.wish_y, motion.wish_turn
+        )
 
 
 @kernel
@@ -450,7 +454,7 @@ def _halt(m: int, begin: float, time: float, end: float, world: ContactWorld) ->
     body = world.bodies[world.first + m]
     turn = motion.turn if motion.freedom == MOVE else 0.0
     _place_robot(motion, body, time, world)
-    _turn_off(motion, body, time, 0.0, 0.0, turn)
+    _change_twist(motion, body, time, 0.0, 0.0, turn)
     _place_robot(motion, body, end, world)
     motion.freedom = TURN_ONLY if motion.freedom == MOVE else STAND
     return True
