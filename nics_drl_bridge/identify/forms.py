@@ -172,19 +172,19 @@ class Form:
     mounted: tuple[str, ...] = ()
     is_timed: bool = False  # True if a measured state tells the latency
 
-    def latency_at(self, inputs: shooting.Inputs, values: Array) -> float:
+    def latency_at(self, parameters: shooting.Parameters, values: Array) -> float:
         """Returns the common latency of the commands for values (I,): their minimum delay [s]."""
-        at = dict(zip(inputs.names, values.tolist(), strict=True))
+        at = dict(zip(parameters.names, values.tolist(), strict=True))
         return float(
             min((at[f"{name}.delay"] for name, _ in self.delays), default=at["latency"])
         )
 
     def curves_at(
-        self, inputs: shooting.Inputs, values: Array
+        self, parameters: shooting.Parameters, values: Array
     ) -> tuple[InputCurve, ...]:
         """Returns the input curves for values (I,)."""
-        at = dict(zip(inputs.names, values.tolist(), strict=True))
-        latency = self.latency_at(inputs, values)
+        at = dict(zip(parameters.names, values.tolist(), strict=True))
+        latency = self.latency_at(parameters, values)
         curves = {c.command: c for c in self.curves}
         for name, _ in self.delays:
             curves.setdefault(name, InputCurve(command=name))
@@ -202,10 +202,10 @@ class Form:
         return tuple(c for c in curves_now if c != InputCurve(command=c.command))
 
     def actuated(
-        self, model: TaylorModel, inputs: shooting.Inputs, values: Array
+        self, model: TaylorModel, parameters: shooting.Parameters, values: Array
     ) -> TaylorModel:
         """Returns a model with lags, friction, drag and limits for values (I,)."""
-        at = dict(zip(inputs.names, values.tolist(), strict=True))
+        at = dict(zip(parameters.names, values.tolist(), strict=True))
         states = model.variables[: model.state_size]
         friction = [max(at.get(f"{name}.friction", 0.0), 0.0) for name in states]
         drag = [max(at.get(f"{name}.drag", 0.0), 0.0) for name in states]
@@ -294,11 +294,11 @@ def make_form(drive: Drive, calibration: Calibration, library: Library) -> Form:
 def choose_start(
     problem: shooting.Shooting,
     model: TaylorModel,
-    inputs: shooting.Inputs,
-    before: shooting.Inputs,
-) -> shooting.Inputs:
+    parameters: shooting.Parameters,
+    before: shooting.Parameters,
+) -> shooting.Parameters:
     """Starts the limits of a state where predictions are best, together with its lag."""
-    names = list(inputs.names)
+    names = list(parameters.names)
     times = [k for k, name in enumerate(names) if name.endswith((".lag", ".delay"))]
     times.append(names.index("latency"))
     coarse = replace(problem, spacing_s=START_SPACING_S)
@@ -309,16 +309,16 @@ def choose_start(
         places = [names.index(f"{state}.{word}") for word in ("rise", "fall")]
         trials = []
         for rate, share in product(RATES, SHARES):
-            start = inputs.start.copy()
+            start = parameters.start.copy()
             start[places] *= rate
             start[times] *= share
-            start = np.clip(start, inputs.low, inputs.high)
+            start = np.clip(start, parameters.low, parameters.high)
             error, _ = coarse.errors(model, start)
             far = np.hypot(error[..., 0], error[..., 1])
             trials.append((float(np.nanmean(far)), start))
         best = min(trials, key=lambda trial: trial[0])
-        inputs = replace(inputs, start=best[1])
-    return inputs
+        parameters = replace(parameters, start=best[1])
+    return parameters
 
 
 def set_lag(
@@ -340,7 +340,7 @@ def make_prediction_problem(
     calibration: Calibration,
     samples: Samples,
     form: Form,
-    inputs: shooting.Inputs,
+    parameters: shooting.Parameters,
 ) -> shooting.Shooting:
     """Returns the prediction problem of a drive on one time axis."""
     command = drive.recording.command
@@ -354,30 +354,31 @@ def make_prediction_problem(
         t = t[0] + dt * (np.arange(-lead, rows[-1] - lead + 1) + MIDDLE_OF_STEP)
 
     @lru_cache(maxsize=8)  # most values of a form do not affect the commands
-    def late(latency: float, curves: tuple[InputCurve, ...]) -> Array:
+    def average_commands(latency: float, curves: tuple[InputCurve, ...]) -> Array:
         return average_effect(command, spec, curves, t - latency, t - latency + dt)
 
-    def all_commands(values: Array) -> Array:
-        return late(form.latency_at(inputs, values), form.curves_at(inputs, values))
+    def compute_all_commands(values: Array) -> Array:
+        latency = form.latency_at(parameters, values)
+        return average_commands(latency, form.curves_at(parameters, values))
 
-    def commands(values: Array) -> Array:
-        return all_commands(values)[rows]
+    def compute_commands(values: Array) -> Array:
+        return compute_all_commands(values)[rows]
 
     @lru_cache(maxsize=8)  # nor do the coefficients affect such a state
     def follow(values: tuple[float, ...]) -> Array:
-        sent = all_commands(np.array(values))
-        at = dict(zip(inputs.names, values, strict=True))
+        sent = compute_all_commands(np.array(values))
+        at = dict(zip(parameters.names, values, strict=True))
         gains = [at.get(f"{v.name}.gain", 1.0) for v in spec.state]
         begin = np.array(gains) * sent[0, list_followed_commands(spec)]
-        model = form.actuated(_make_follower(spec, dt), inputs, np.array(values))
+        model = form.actuated(_make_follower(spec, dt), parameters, np.array(values))
         _, states = roll(model, begin[None], sent[None])
         return np.asarray(states[0][rows])
 
-    def inferred(values: Array) -> Array:
+    def infer_states(values: Array) -> Array:
         return follow(tuple(values.tolist()))
 
-    def shaped(model: TaylorModel, values: Array) -> TaylorModel:
-        return form.actuated(model, inputs, values)
+    def shape(model: TaylorModel, values: Array) -> TaylorModel:
+        return form.actuated(model, parameters, values)
 
     def trust(start: Array, end: Array) -> Array:
         offset = calibration.clock_offset_s
@@ -386,10 +387,10 @@ def make_prediction_problem(
     noise, _ = drive.pose_noise or (0.0, 0.0)
     return shooting.Shooting(
         samples,
-        commands,
-        shaped,
+        compute_commands,
+        shape,
         trust,
-        inferred if form.followed else None,
+        infer_states if form.followed else None,
         bool(form.mounted),
         noise,
     )
@@ -410,9 +411,9 @@ def _make_follower(spec: RobotSpec, dt: float) -> TaylorModel:
     )
 
 
-def list_inputs(
+def list_parameters(
     drive: Drive, calibration: Calibration, samples: Samples, form: Form
-) -> shooting.Inputs:
+) -> shooting.Parameters:
     """Returns the values to be estimated besides coefficients: latency, and those of a form."""
     rows = _list_command_values(drive, calibration.command_latency_s, form)
     rows |= _list_follower_values(drive, calibration, form)
@@ -448,7 +449,7 @@ def list_inputs(
         ):
             most = most if name in form.mounted else 0.0
             rows[name] = (0.0, scale, -most, most)
-    return shooting.Inputs(tuple(rows), *np.array(list(rows.values())).T)
+    return shooting.Parameters(tuple(rows), *np.array(list(rows.values())).T)
 
 
 def _list_follower_values(
@@ -603,17 +604,17 @@ def find_likely_delay(
 ) -> float:
     """Returns the delay [s] of the commands that best explains the rates of the state."""
     form = Form(calibration.inputs)
-    inputs = list_inputs(drive, calibration, samples, form)
-    problem = make_prediction_problem(drive, calibration, samples, form, inputs)
+    parameters = list_parameters(drive, calibration, samples, form)
+    problem = make_prediction_problem(drive, calibration, samples, form, parameters)
     trials = np.arange(0.0, LONGEST_S, DELAY_STEP_S)
     if drive.recording.pose.clock != drive.recording.command.clock:
         trials = trials - LONGEST_S / 2.0
     width = choose_half_width(drive)
     left = []
     for delay in trials:
-        command = problem.commands(np.append(delay, inputs.start[1:]))
-        late = smooth_commands(command, samples.dt, width)
-        left.append(_measure_unexplained(drive.spec, samples, late))
+        command = problem.commands(np.append(delay, parameters.start[1:]))
+        smooth = smooth_commands(command, samples.dt, width)
+        left.append(_measure_unexplained(drive.spec, samples, smooth))
     if np.isfinite(left).all():
         return float(trials[int(np.argmin(left))])
     return calibration.command_latency_s

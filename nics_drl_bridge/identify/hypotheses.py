@@ -72,7 +72,7 @@ class Draft:
 
     library: terms.Library
     form: forms.Form
-    inputs: shooting.Inputs
+    parameters: shooting.Parameters
     problem: shooting.Shooting
 
     @property
@@ -82,10 +82,10 @@ class Draft:
 
     def select(self, inside: terms.Mask | None) -> Samples:
         """Returns the samples inside (T,), with the states that follow the commands."""
-        samples = self.problem.resample(self.inputs.start)
+        samples = self.problem.resample(self.parameters.start)
         return samples if inside is None else samples.rows(inside)
 
-    def base(
+    def fit_base(
         self, inside: terms.Mask | None = None, other: TaylorModel | None = None
     ) -> shooting.Predictive:
         """Fits the base's terms, gains and lags; the search may start at another model."""
@@ -100,14 +100,14 @@ class Draft:
             self.problem,
             model,
             self.library.select_free(model),
-            self.inputs,
+            self.parameters,
             inside,
             BASE_EVALUATIONS,
             first=first,
         )
         return replace(fitted, model=terms.stabilise(fitted.model, spec))
 
-    def refined(
+    def refine(
         self,
         base: TaylorModel,
         linear: TaylorModel,
@@ -124,10 +124,10 @@ class Draft:
         )
         free = self.library.select_free(both)
         return shooting.fit_to_predictions(
-            self.problem, base, free, self.inputs, inside, evaluations, pull, first
+            self.problem, base, free, self.parameters, inside, evaluations, pull, first
         )
 
-    def error_of(self, predictive: shooting.Predictive) -> float:
+    def measure_error(self, predictive: shooting.Predictive) -> float:
         """Returns the mean distance of predicted from measured ends, over all horizons [m]."""
         error = self.problem.errors(predictive.model, predictive.values)[0]
         return float(np.nanmean(np.hypot(error[..., 0], error[..., 1])))
@@ -136,7 +136,7 @@ class Draft:
         self, found: shooting.Predictive, calibration: Calibration
     ) -> Calibration:
         """Returns a calibration with delays, input curves, lags and mounting of a search."""
-        at = dict(zip(self.inputs.names, found.values.tolist(), strict=True))
+        at = dict(zip(self.parameters.names, found.values.tolist(), strict=True))
         responses = (
             replace(
                 response,
@@ -145,8 +145,8 @@ class Draft:
             )
             for response in calibration.responses
         )
-        latency = self.form.latency_at(self.inputs, found.values)
-        known = calibration.uncertainty | found.named_errors(self.inputs.names)
+        latency = self.form.latency_at(self.parameters, found.values)
+        known = calibration.uncertainty | found.named_errors(self.parameters.names)
         within_step = WITHIN_STEP * self.problem.samples.dt
         for name, _ in self.form.delays:
             key = f"{name}.delay"
@@ -168,7 +168,7 @@ class Draft:
             calibration,
             clock_offset_s=offset,
             command_latency_s=latency,
-            inputs=self.form.curves_at(self.inputs, found.values),
+            inputs=self.form.curves_at(self.parameters, found.values),
             responses=tuple(responses),
             uncertainty=known,
         )
@@ -178,7 +178,7 @@ class Draft:
 
     def _estimate_time_error(self, found: shooting.Predictive) -> float:
         """Returns the standard error of the latency [s], which the model's step widens."""
-        names = list(self.inputs.names)
+        names = list(self.parameters.names)
         name = "latency"
         if self.form.delays:
             at = dict(zip(names, found.values.tolist(), strict=True))
@@ -194,8 +194,10 @@ class Draft:
         """Returns a found model with standard errors; those of other terms are a linear fit's."""
         model = found.model
         errors = estimate_coefficient_errors(found)
-        at = dict(zip(self.inputs.names, found.values.tolist(), strict=True))
-        sigma = dict(zip(self.inputs.names, found.value_errors.tolist(), strict=True))
+        at = dict(zip(self.parameters.names, found.values.tolist(), strict=True))
+        sigma = dict(
+            zip(self.parameters.names, found.value_errors.tolist(), strict=True)
+        )
         for state, command in self.form.followed:
             row = terms.FIRST_STATE + model.variables.index(state)
             own = terms.find_linear_term(model, state)
@@ -225,21 +227,21 @@ class Draft:
             return found
         pruned = replace(model, coefficients=coefficients)
         free = self.library.select_free(pruned)
-        inputs = replace(self.inputs, start=found.values)
-        return shooting.fit_to_predictions(self.problem, pruned, free, inputs)
+        parameters = replace(self.parameters, start=found.values)
+        return shooting.fit_to_predictions(self.problem, pruned, free, parameters)
 
-    def tried(self, asked: tuple[Hypothesis, ...]) -> tuple[Trial, ...]:
+    def cross_validate(self, asked: tuple[Hypothesis, ...]) -> tuple[Trial, ...]:
         """Cross-validates each hypothesis over `FOLDS` parts of a drive.
 
         A part is not left out if a variable would not have moved without it, or if the rest is too
         short to fit a model.
         """
         samples = self.problem.samples
-        values = self.inputs.start
+        values = self.parameters.start
         everything = np.arange(len(samples.t))
         unmoved = list_unmoved_variables(samples, self.spec)
         problem = replace(self.problem, spacing_s=SPACING_S, fixed=values)
-        fixed = replace(self, problem=problem, inputs=shooting.NOTHING_FREE)
+        fixed = replace(self, problem=problem, parameters=shooting.NO_PARAMETERS)
         nothing = np.zeros((0, len(BANDS_S)))
         distances = dict.fromkeys(asked, nothing)  # (W, H) of ends
         paths = nothing  # (W, H)
@@ -249,7 +251,7 @@ class Draft:
             if list_unmoved_variables(samples.rows(~unseen), self.spec) != unmoved:
                 continue
             try:
-                models = list(fixed.models(asked, ~unseen))
+                models = list(fixed.fit_models(asked, ~unseen))
             except FitError:
                 continue
             for hypothesis, model in models:
@@ -267,12 +269,12 @@ class Draft:
             trials.append(Trial(order, pull, share, errors))
         return tuple(trials)
 
-    def models(
+    def fit_models(
         self, asked: tuple[Hypothesis, ...], inside: terms.Mask
     ) -> Iterator[tuple[Hypothesis, TaylorModel]]:
         """Yields the model of each hypothesis, fitted to the rows inside (T,)."""
         samples = self.select(inside)
-        base = self.base(inside).model
+        base = self.fit_base(inside).model
         starts: dict[int, TaylorModel] = {}  # of the searches, by order
         for order, pull in asked:
             if not pull:
@@ -280,7 +282,7 @@ class Draft:
                 continue
             if order not in starts:
                 starts[order] = self.library.fit(samples, order).model
-            refined = self.refined(base, starts[order], inside, EVALUATIONS, pull)
+            refined = self.refine(base, starts[order], inside, EVALUATIONS, pull)
             starts[order] = refined.model  # near the best model of the next pull
             yield (order, pull), refined.model
 
@@ -299,7 +301,7 @@ class Candidate:
 class Base:
     """The textbook's terms with the best-predicting form, from which models depart."""
 
-    draft: Draft  # its inputs start from the values found
+    draft: Draft  # its parameters start from the values found
     found: shooting.Predictive
     candidates: tuple[Candidate, ...] = ()  # forms that were tried, in this order
 
@@ -310,49 +312,20 @@ def fit_base(
     samples: Samples,
     library: terms.Library,
     clear: tuple[InputCurve, ...],
-    former: Base | None = None,
 ) -> Base:
     """Fits the textbook with and without each part of a form; keeps what improves predictions.
 
-    `clear` curves are always kept. A known base is refitted to other data.
+    `clear` curves are always kept.
     """
-
-    def fitted(form: forms.Form, before: Base | None = None) -> Base:
-        inputs = forms.list_inputs(drive, calibration, samples, form)
-        first = None
-        if before is not None:
-            inputs = inputs.begun_at(before.draft.inputs)
-            first = before.found.model
-        problem = forms.make_prediction_problem(
-            drive, calibration, samples, form, inputs
-        )
-        if before is not None:
-            inputs = forms.choose_start(
-                problem, before.found.model, inputs, before.draft.inputs
-            )
-        draft = Draft(library, form, inputs, replace(problem, spacing_s=SPACING_S))
-        predictive = draft.base(other=first)
-        inputs = replace(inputs, start=predictive.values)
-        return Base(replace(draft, inputs=inputs, problem=problem), predictive)
-
-    def cross_validate(base: Base) -> Trial:
-        return base.draft.tried((TEXTBOOK,))[0]
-
+    problem = BaseProblem(drive, calibration, samples, library)
     plain_form = forms.make_form(drive, calibration, library)
-
-    if former is not None:
-        form = replace(
-            former.draft.form, curves=calibration.inputs, followed=plain_form.followed
-        )
-        refitted = fitted(form, former if form.followed else None)
-        return replace(refitted, candidates=former.candidates)
-    best = fitted(replace(plain_form, curves=calibration.inputs))
-    trial = cross_validate(best)
+    best = problem.fit(replace(plain_form, curves=calibration.inputs))
+    trial = cross_validate_base(best)
     start = "textbook with input curves" if calibration.inputs else "textbook"
     candidates = [Candidate(start, trial.error, kept=True)]
     if len(calibration.inputs) > len(clear):
-        plain = fitted(replace(plain_form, curves=clear))
-        plain_trial = cross_validate(plain)
+        plain = problem.fit(replace(plain_form, curves=clear))
+        plain_trial = cross_validate_base(plain)
         # an infinite level: too short to judge
         is_better = plain_trial.level < trial.level or np.isinf(plain_trial.level)
         candidates = [
@@ -362,12 +335,13 @@ def fit_base(
         if is_better:
             best = plain
             trial = plain_trial
+    # Each change builds on those that were kept before it, so their order matters.
     for name, change, worth in list_changes(drive, calibration, samples, library):
         form = change(best.draft.form)
         if form == best.draft.form:
             continue
-        changed = fitted(form, best)
-        changed_trial = cross_validate(changed)
+        changed = problem.fit(form, best)
+        changed_trial = cross_validate_base(changed)
         is_better = changed_trial.level < worth * trial.level and _is_certain(
             changed, best
         )
@@ -376,6 +350,55 @@ def fit_base(
             best = changed
             trial = changed_trial
     return replace(best, candidates=tuple(candidates))
+
+
+def refit_base(
+    drive: Drive,
+    calibration: Calibration,
+    samples: Samples,
+    library: terms.Library,
+    former: Base,
+) -> Base:
+    """Fits a base of the same form to other data."""
+    followed = forms.make_form(drive, calibration, library).followed
+    form = replace(former.draft.form, curves=calibration.inputs, followed=followed)
+    problem = BaseProblem(drive, calibration, samples, library)
+    refitted = problem.fit(form, former if form.followed else None)
+    return replace(refitted, candidates=former.candidates)
+
+
+@dataclass(frozen=True)
+class BaseProblem:
+    """What a base is fitted to."""
+
+    drive: Drive
+    calibration: Calibration
+    samples: Samples
+    library: terms.Library
+
+    def fit(self, form: forms.Form, start: Base | None = None) -> Base:
+        """Fits the textbook with a form; the search may start at another base."""
+        data = (self.drive, self.calibration, self.samples, form)
+        parameters = forms.list_parameters(*data)
+        if start is not None:
+            parameters = parameters.start_from(start.draft.parameters)
+        problem = forms.make_prediction_problem(*data, parameters)
+        model = None
+        if start is not None:
+            model = start.found.model
+            parameters = forms.choose_start(
+                problem, model, parameters, start.draft.parameters
+            )
+        coarse = replace(problem, spacing_s=SPACING_S)
+        draft = Draft(self.library, form, parameters, coarse)
+        predictive = draft.fit_base(other=model)
+        parameters = replace(parameters, start=predictive.values)
+        return Base(replace(draft, parameters=parameters, problem=problem), predictive)
+
+
+def cross_validate_base(base: Base) -> Trial:
+    """Cross-validates the textbook with the form of a base."""
+    return base.draft.cross_validate((TEXTBOOK,))[0]
 
 
 def list_changes(
@@ -428,7 +451,7 @@ def list_changes(
 def _is_certain(changed: Base, before: Base) -> bool:
     """True if dead zones and limits that a change added clearly exceed their standard errors."""
     values = zip(
-        changed.draft.inputs.names,
+        changed.draft.parameters.names,
         changed.found.values.tolist(),
         changed.found.value_errors.tolist(),
         strict=True,
@@ -437,7 +460,7 @@ def _is_certain(changed: Base, before: Base) -> bool:
         value < CERTAIN * error
         for name, value, error in values
         if name.endswith((".dead", ".fall", ".rise"))
-        and name not in before.draft.inputs.names
+        and name not in before.draft.parameters.names
     )
 
 
@@ -555,15 +578,17 @@ def drop_doubtful_mounting(
         rest[2] = -mounting[2]
     aside = geometry.rotate(mounting[:2], float(rest[2]))
     rest[:2] = np.where(doubtful[:2], -aside, rest[:2])
-    inputs = draft.inputs
-    start = inputs.start.copy()
-    low = inputs.low.copy()
-    high = inputs.high.copy()
+    parameters = draft.parameters
+    start = parameters.start.copy()
+    low = parameters.low.copy()
+    high = parameters.high.copy()
     start[-3:] = rest
     places = np.flatnonzero(doubtful) + len(start) - 3
     low[places] = start[places]
     high[places] = start[places]
-    return replace(draft, inputs=replace(inputs, start=start, low=low, high=high))
+    return replace(
+        draft, parameters=replace(parameters, start=start, low=low, high=high)
+    )
 
 
 def add_predicted_mounting(

@@ -176,13 +176,13 @@ def _adjust_to_rows(
     """Adjusts a model, and its inputs, to the rows that are kept (T,)."""
     draft = base.draft
     problem = make_prediction_problem(
-        training, calibration, samples, draft.form, draft.inputs
+        training, calibration, samples, draft.form, draft.parameters
     )
     problem = replace(problem, spacing_s=hypotheses.SPACING_S)
     free = draft.library.select_free(model)
     pull = hypotheses.PULLS[-1]
     fitted = shooting.fit_to_predictions(
-        problem, model, free, draft.inputs, kept, EVALUATIONS, pull
+        problem, model, free, draft.parameters, kept, EVALUATIONS, pull
     )
     calibration = replace(draft, problem=problem).calibrate(fitted, calibration)
     return replace(fitted.model, inputs=calibration.inputs), calibration

@@ -52,20 +52,19 @@ def fit_by_predictions(drive: Drive, findings: Findings) -> Findings:
     library = make_library(drive, findings)
     samples = resample_drive(training, findings)
     try:
-        base = hypotheses.fit_base(
-            training,
-            findings.calibration,
-            samples,
-            library,
-            findings.clear_curves,
-            findings.base,
-        )
+        data = (training, findings.calibration, samples, library)
+        if findings.base is None:
+            base = hypotheses.fit_base(*data, findings.clear_curves)
+        else:
+            base = hypotheses.refit_base(*data, findings.base)
         trials = findings.trials  # a refit reuses the choice
-        trials = trials or base.draft.tried(hypotheses.list_hypotheses(order, library))
+        trials = trials or base.draft.cross_validate(
+            hypotheses.list_hypotheses(order, library)
+        )
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
     best = hypotheses.choose_trial(trials, order)
-    curves = base.draft.form.curves_at(base.draft.inputs, base.found.values)
+    curves = base.draft.form.curves_at(base.draft.parameters, base.found.values)
     if library.kind is Kind.MOTION:
         calibration = replace(findings.calibration, inputs=curves)
         findings = replace(findings, calibration=calibration)
@@ -117,14 +116,15 @@ def refine_by_predictions(drive: Drive, findings: Findings) -> Findings:
             found, has_order = _search_model(draft, base, terms, best)
     if draft.library.kind is not Kind.MOTION:
         found = draft.prune(found, drive.settings.alpha)
-    before = draft.form.latency_at(draft.inputs, found.values)
+    before = draft.form.latency_at(draft.parameters, found.values)
     calibration = draft.calibrate(found, calibration)
     values = found.values.copy()
     if draft.problem.mounted:  # the calibration has the mounting now
         values[-3:] = 0.0
-    inputs = replace(draft.inputs, start=values)
+    parameters = replace(draft.parameters, start=values)
     draft = replace(
-        draft, inputs=inputs.shifted(before - calibration.command_latency_s)
+        draft,
+        parameters=parameters.shift_stamps(before - calibration.command_latency_s),
     )
     base = replace(base, draft=draft)
     if draft.library.kind is Kind.MOTION:
@@ -156,7 +156,7 @@ def _add_sums(
     errors = dict(calibration.uncertainty)
     if not errors.get("command_latency_s", 0.0) > SEPARABLE_S:
         return calibration
-    names = list(draft.inputs.names)
+    names = list(draft.parameters.names)
     for state, command in draft.form.followed:
         delay = f"{command}.delay"
         pair = [names.index(delay if delay in names else "latency")]
@@ -184,10 +184,12 @@ def _search_model(
         best: the chosen order.
     """
     if best.pull:
-        refined = draft.refined(base.found.model, terms, pull=best.pull)
-        if not verdict.is_worse(draft.error_of(refined), draft.error_of(base.found)):
+        refined = draft.refine(base.found.model, terms, pull=best.pull)
+        if not verdict.is_worse(
+            draft.measure_error(refined), draft.measure_error(base.found)
+        ):
             return refined, True
-    textbook = draft.base(other=base.found.model)
+    textbook = draft.fit_base(other=base.found.model)
     return textbook, best.pull == 0.0
 
 
@@ -196,11 +198,11 @@ def _separate_lags(
 ) -> tuple[Calibration, tuple[str, ...]]:
     """Drops the latency's error where lags hide it; returns a sentence on their sums instead."""
     draft = base.draft
-    curves = draft.form.curves_at(draft.inputs, base.found.values)
+    curves = draft.form.curves_at(draft.parameters, base.found.values)
     lags = hypotheses.find_lags(replace(base.found.model, inputs=curves), spec)
     if not lags:
         return calibration, ()
-    beside = draft.form.latency_at(draft.inputs, base.found.values)
+    beside = draft.form.latency_at(draft.parameters, base.found.values)
     sums = hypotheses.describe_lag_sums(calibration.command_latency_s, lags, beside)
     errors = dict(calibration.uncertainty)
     errors.pop("command_latency_s", None)

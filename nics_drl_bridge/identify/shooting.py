@@ -42,7 +42,7 @@ PULL = 0.001  # usual weight of the first coefficients relative to the predictio
 # error that weighs as much, at a pull of 1, as a term the size of the rates
 REFERENCE_M_S = 0.1
 DRIFT_M_S = 0.01  # drift of good predictions: noise counts as this much time
-# step of finite differences by the values of inputs, relative to their scale
+# step of finite differences by the values of parameters, relative to their scale
 DIFFERENCE = 0.02
 EVALUATIONS = 60
 # minimum distance of a start value from its bounds, as a fraction of its range
@@ -54,8 +54,13 @@ SAME_STEP = 0.01  # fraction of a step by which two steps may differ
 
 
 @dataclass(frozen=True)
-class Inputs:
-    """Values that the commands in effect depend on, such as a delay [s], and their bounds."""
+class Parameters:
+    """Parameters of a model besides its coefficients, such as a delay, and their bounds.
+
+    A name is `latency`, a part of the mounting, or that of a command or state and of its part, such
+    as `throttle.delay` [s], `vx.lag` [s], `vx.gain`, `vx.rise` and `vx.fall` (limits) or
+    `throttle.dead`; `forms.list_parameters` lists them. The mounting comes last.
+    """
 
     names: tuple[str, ...]  # of the values
     start: Array  # (I,)
@@ -68,7 +73,7 @@ class Inputs:
         """Indices of the unknown values."""
         return np.flatnonzero(self.high > self.low)
 
-    def shifted(self, latency_s: float) -> "Inputs":
+    def shift_stamps(self, latency_s: float) -> "Parameters":
         """Returns the same delays relative to stamps that are later by a time [s]."""
         is_time = [name == "latency" or name.endswith(".delay") for name in self.names]
         later = np.where(is_time, latency_s, 0.0)
@@ -79,8 +84,8 @@ class Inputs:
             high=self.high - later,
         )
 
-    def begun_at(self, other: "Inputs") -> "Inputs":
-        """Starts from the values of other inputs, where these have them."""
+    def start_from(self, other: "Parameters") -> "Parameters":
+        """Starts from the values of other parameters, where these have them."""
         values = dict(zip(other.names, other.start.tolist(), strict=True))
         start = [
             values.get(name, at)
@@ -95,7 +100,7 @@ class Shooting:
 
     samples: Samples
     commands: Commands
-    shaped: Shape
+    shape: Shape
     trust: Trust
     # of states that were not measured; None if the samples have the states
     inferred: States | None = None
@@ -106,7 +111,7 @@ class Shooting:
     horizons: tuple[float, ...] = HORIZONS_S
     spacing_s: float = SPACING_S
 
-    def starts(self, inside: Mask | None = None) -> tuple[Rows, Rows]:
+    def list_windows(self, inside: Mask | None = None) -> tuple[Rows, Rows]:
         """Returns first rows (W,) of windows, and steps (W, H) to their horizons; 0: not inside.
 
         Windows have no gaps, and only rows `inside` (T,).
@@ -133,16 +138,16 @@ class Shooting:
     @property
     def longest_horizon_s(self) -> float:
         """The longest horizon that fits into the drive; 0 if none does [s]."""
-        _, steps = self.starts()
+        _, steps = self.list_windows()
         fits = steps.any(axis=0)
         return max(np.array(self.horizons)[fits].tolist(), default=0.0)
 
-    def moved(self, first: Rows, steps: Rows) -> Array:
+    def measure_motion(self, first: Rows, steps: Rows) -> Array:
         """Returns the measured poses (W, H, 3) at windows' horizons, relative to the starts."""
         pose = self.samples.q[:, :3]
         return geometry.between(pose[first][:, None], pose[first[:, None] + steps])
 
-    def paths(self, first: Rows, steps: Rows) -> Array:
+    def measure_paths(self, first: Rows, steps: Rows) -> Array:
         """Returns the lengths (W, H) of the measured paths over windows [m]."""
         length = np.append(
             0.0, np.cumsum(np.hypot(*np.diff(self.samples.q[:, :2], axis=0).T))
@@ -159,7 +164,7 @@ class Shooting:
     ) -> tuple[Array, Array]:
         """Returns poses (W, H, 3), derivatives (W, H, 3, P) by the `free` (D, K) coefficients."""
         values = values if self.fixed is None else self.fixed
-        model = self.shaped(model, values)
+        model = self.shape(model, values)
         state = (
             self.samples.q[:, 3:] if self.inferred is None else self.inferred(values)
         )
@@ -178,7 +183,9 @@ class Shooting:
         )
         sizes = state.shape[1], command.shape[1], len(terms.dof), len(moving)
         shoot(shot, terms, moving, model.dt, tangent(*sizes))
-        return _seen_from(values[-3:], shot) if self.mounted else (shot.end, shot.slope)
+        return (
+            _mount_poses(values[-3:], shot) if self.mounted else (shot.end, shot.slope)
+        )
 
     def resample(self, values: Array) -> Samples:
         """Returns the samples with the commands in effect, and with inferred states."""
@@ -196,15 +203,17 @@ class Shooting:
 
         Both are NaN where a horizon does not fit; errors of diverged predictions are infinite.
         """
-        first, steps = self.starts(inside)
-        error = self.predict(model, values, first, steps)[0] - self.moved(first, steps)
+        first, steps = self.list_windows(inside)
+        error = self.predict(model, values, first, steps)[0] - self.measure_motion(
+            first, steps
+        )
         error[..., 2] = geometry.wrap_angle(error[..., 2])
         error[np.isnan(error)] = np.inf
         error[steps == 0] = np.nan
-        return error, np.where(steps > 0, self.paths(first, steps), np.nan)
+        return error, np.where(steps > 0, self.measure_paths(first, steps), np.nan)
 
 
-def _seen_from(mounting: Array, shot: Shot) -> tuple[Array, Array]:
+def _mount_poses(mounting: Array, shot: Shot) -> tuple[Array, Array]:
     """Returns ends (W, H, 3) and their derivatives for a body at a pose (3,) in the base."""
     end = geometry.between(mounting, geometry.compose(shot.end, mounting))
     end[..., 2] = shot.end[..., 2]
@@ -225,7 +234,7 @@ class Predictive:
     """A model fitted to predictions."""
 
     model: TaylorModel
-    values: Array  # (I,) of the inputs
+    values: Array  # (I,) of the parameters
     jacobian: Array  # (n, P) of the residual by the free coefficients
     residual: Array  # (n,) scaled errors [m/s]
     free: Mask  # (D, K)
@@ -249,14 +258,14 @@ class Predictive:
         }
 
 
-NOTHING_FREE = Inputs((), *(np.zeros(0) for _ in range(4)))
+NO_PARAMETERS = Parameters((), *(np.zeros(0) for _ in range(4)))
 
 
 def fit_to_predictions(
     problem: Shooting,
     model: TaylorModel,
     free: Mask,
-    inputs: Inputs,
+    parameters: Parameters,
     inside: Mask | None = None,
     evaluations: int = EVALUATIONS,
     pull: float = PULL,
@@ -266,7 +275,9 @@ def fit_to_predictions(
 
     Coefficients are pulled towards the model's. The search starts at `first` if that is better.
     """
-    return _Search(problem, model, free, inputs, inside, pull).run(first, evaluations)
+    return _Search(problem, model, free, parameters, inside, pull).run(
+        first, evaluations
+    )
 
 
 class _Search:
@@ -277,21 +288,21 @@ class _Search:
         problem: Shooting,
         model: TaylorModel,
         free: Mask,
-        inputs: Inputs,
+        parameters: Parameters,
         inside: Mask | None,
         pull: float,
     ) -> None:
         self.problem = problem
         self.model = model
         self.free = free
-        self.inputs = inputs
+        self.parameters = parameters
         size = np.sqrt(
             (taylor.evaluate(problem.samples.x, model.powers) ** 2).mean(axis=0)
         )
         spread = np.maximum(problem.samples.dq.std(axis=0), 1e-6)
         # Coefficients (D, K) that make each term as large as the rates usually are.
         self.unit = (spread[:, None] / np.maximum(size, 1e-9))[free]
-        self.first, self.steps = problem.starts(inside)
+        self.first, self.steps = problem.list_windows(inside)
         self.wanted = self.steps > 0
         weight = np.array([1.0, 1.0, HEADING_ARM_M])
         usual = np.array(problem.horizons) + problem.noise_m / DRIFT_M_S
@@ -300,25 +311,25 @@ class _Search:
             t[self.first][:, None], t[self.first[:, None] + self.steps]
         )
         self.weight = weight / usual[:, None] * np.sqrt(trust)
-        self.measured = problem.moved(self.first, self.steps)
-        self.sought = inputs.sought
+        self.measured = problem.measure_motion(self.first, self.steps)
+        self.sought = parameters.sought
         self.count = len(self.sought)
         self.pull = REFERENCE_M_S * np.sqrt(pull * 3 * np.count_nonzero(self.wanted))
 
     def at(self, theta: Array) -> tuple[TaylorModel, Array]:
-        """Returns the model, before values shape it, and the values of the inputs."""
+        """Returns the model, before values shape it, and the values of the parameters."""
         coefficients = self.model.coefficients.copy()
         coefficients[self.free] += theta[self.count :] * self.unit
-        late = self.inputs.start.copy()
-        late[self.sought] += self.inputs.scale[self.sought] * theta[: self.count]
-        late = late if self.problem.fixed is None else self.problem.fixed
-        return replace(self.model, coefficients=coefficients), late
+        values = self.parameters.start.copy()
+        values[self.sought] += self.parameters.scale[self.sought] * theta[: self.count]
+        values = values if self.problem.fixed is None else self.problem.fixed
+        return replace(self.model, coefficients=coefficients), values
 
     def shot(self, theta: Array, sloped: bool) -> tuple[Array, Array]:
         """Returns scaled errors (n,), and derivatives (n, P) by the coefficients."""
-        trial, late = self.at(theta)
+        trial, values = self.at(theta)
         free = self.free if sloped else None
-        end, slope = self.problem.predict(trial, late, self.first, self.steps, free)
+        end, slope = self.problem.predict(trial, values, self.first, self.steps, free)
         error = end - self.measured
         error[..., 2] = geometry.wrap_angle(error[..., 2])
         rest = np.clip(error, -FARTHEST_M, FARTHEST_M) * self.weight
@@ -335,21 +346,21 @@ class _Search:
         count = self.count
         unit = self.unit
         rest, slope = self.shot(theta, True)
-        late = self.late(theta, rest)
+        by_values = self.differentiate_by_values(theta, rest)
         slope = np.clip(np.nan_to_num(slope * unit), -STEEPEST, STEEPEST)
         own = np.concatenate(
             [np.zeros((len(unit), count)), self.pull * np.eye(len(unit))], axis=1
         )
-        return np.concatenate([np.concatenate([late, slope], axis=1), own])
+        return np.concatenate([np.concatenate([by_values, slope], axis=1), own])
 
-    def late(self, theta: Array, rest: Array) -> Array:
+    def differentiate_by_values(self, theta: Array, rest: Array) -> Array:
         """Returns derivatives (n, I) of errors (n,) by the scaled values."""
         slopes = np.zeros((len(rest), self.count))
         for i, value in enumerate(self.sought):
             step = DIFFERENCE
-            if self.inputs.names[value].endswith(("latency", ".delay")):
+            if self.parameters.names[value].endswith(("latency", ".delay")):
                 # A limited state starts to move at a whole step.
-                step = self.model.dt / self.inputs.scale[value]
+                step = self.model.dt / self.parameters.scale[value]
             trial = theta.copy()
             trial[i] += step
             errors, _ = self.shot(trial, False)
@@ -372,10 +383,10 @@ class _Search:
                 begun = rest
         low = np.full(len(start), -np.inf)
         high = -low
-        inputs = self.inputs
+        parameters = self.parameters
         at = self.sought
-        low[:count] = ((inputs.low - inputs.start) / inputs.scale)[at]
-        high[:count] = ((inputs.high - inputs.start) / inputs.scale)[at]
+        low[:count] = ((parameters.low - parameters.start) / parameters.scale)[at]
+        high[:count] = ((parameters.high - parameters.start) / parameters.scale)[at]
         # At a bound the search would not move.
         aside = np.minimum(INSIDE * (high - low)[:count], 1.0)
         start[:count] = np.clip(0.0, low[:count] + aside, high[:count] - aside)
@@ -387,22 +398,22 @@ class _Search:
 
     def predictive(self, theta: Array) -> Predictive:
         """Returns the model with the data for its uncertainty."""
-        best, late = self.at(theta)
-        best = self.problem.shaped(best, late)
+        best, values = self.at(theta)
+        best = self.problem.shape(best, values)
         rest, slope = self.shot(theta, True)
         slope = np.clip(np.nan_to_num(slope), -STEEPEST, STEEPEST)
         starts = np.repeat(
             self.problem.samples.t[self.first], 3 * self.wanted.sum(axis=1)
         )
         span = np.floor(starts / max(self.problem.horizons)).astype(np.intp)
-        size = len(self.inputs.start)
+        size = len(self.parameters.start)
         covariance = np.full((size, size), np.nan)
         if self.count:
-            by_values = self.late(theta, rest)
+            by_values = self.differentiate_by_values(theta, rest)
             both = np.concatenate([by_values, slope * self.unit], axis=1)
             prior = np.append(np.zeros(self.count), np.full(len(self.unit), self.pull))
             joint = estimate_clustered_covariance(both, rest, span, prior**2)
-            scale = self.inputs.scale[self.sought]
+            scale = self.parameters.scale[self.sought]
             known = joint[: self.count, : self.count] * np.outer(scale, scale)
             covariance[np.ix_(self.sought, self.sought)] = known
-        return Predictive(best, late, slope, rest, self.free, starts, covariance)
+        return Predictive(best, values, slope, rest, self.free, starts, covariance)

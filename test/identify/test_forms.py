@@ -20,7 +20,7 @@ from nics_drl_bridge.identify.forms import (
     drop_unreached_ends,
     find_input_curve,
     find_two_way_curves,
-    list_inputs,
+    list_parameters,
     make_prediction_problem,
 )
 from nics_drl_bridge.identify.identify import (
@@ -52,7 +52,7 @@ def samples(found) -> Samples:
 
 def form_inputs(found, samples, form):
     calibration = replace(found.calibration, command_latency_s=0.05)
-    return list_inputs(found.training, calibration, samples, form)
+    return list_parameters(found.training, calibration, samples, form)
 
 
 def test_a_dead_zone_is_seen_in_the_speed_that_a_throttle_makes(found, samples):
@@ -102,7 +102,7 @@ def test_values_are_sought_by_name_from_what_the_motion_shows(found, samples):
 def test_a_form_that_grows_starts_where_the_smaller_one_ended(found, samples):
     small = form_inputs(found, samples, Form((CURVE,)))
     ended = replace(small, start=small.start + np.array([0.02, 0.01, 0.0, 0.03]))
-    larger = form_inputs(found, samples, Form((CURVE,), drag=("vx",))).begun_at(ended)
+    larger = form_inputs(found, samples, Form((CURVE,), drag=("vx",))).start_from(ended)
     assert larger.start[:4] == pytest.approx(ended.start)
     assert larger.start[4] > 0.0
 

@@ -39,7 +39,7 @@ def base(**given):
     best = fit_base(
         found.training, found.calibration, samples, library, found.clear_curves
     )
-    names = best.draft.inputs.names
+    names = best.draft.parameters.names
     values = best.found.values.tolist()
     return best.draft.form, dict(zip(names, values, strict=True))
 

@@ -95,7 +95,7 @@ def test_no_window_of_the_fit_crosses_either(together):
     problem = Shooting(
         samples, lambda _: samples.x, lambda model, _: model, lambda *_: np.ones(3)
     )
-    first, steps = problem.starts()
+    first, steps = problem.list_windows()
     at = recording.episode_at(samples.t)
     assert set(at) == {0, 1, 2, 3}
     for column in steps.T:

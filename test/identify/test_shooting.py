@@ -10,8 +10,8 @@ import pytest
 from identify.drives import make_model, slipping_car
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.shooting import (
-    NOTHING_FREE,
-    Inputs,
+    NO_PARAMETERS,
+    Parameters,
     Shooting,
     fit_to_predictions,
 )
@@ -65,7 +65,9 @@ def problem(car) -> Shooting:
     return Shooting(samples, commands, lambda model, values: model, equally)
 
 
-DELAYS = Inputs(("latency",), *(np.array([value]) for value in (0.05, 0.05, 0.0, 0.4)))
+DELAYS = Parameters(
+    ("latency",), *(np.array([value]) for value in (0.05, 0.05, 0.0, 0.4))
+)
 
 
 def test_coefficients_and_a_delay_are_found_together(car, problem):
@@ -89,7 +91,7 @@ def test_windows_that_are_predicted_together_end_as_each_alone(car, problem):
         limits=np.array([[-1.0, 1.5], [-np.inf, np.inf], [-6.0, 6.0]]),
         back_emf=np.outer([0.5, 0.0, 0.0], [1.0, 0.0]),
     )
-    first, steps = problem.starts()
+    first, steps = problem.list_windows()
     # the last have shorter horizons
     first = first[::-1][:41]
     steps = steps[::-1][:41]
@@ -117,20 +119,22 @@ def test_a_value_between_equal_bounds_stays_and_has_no_error(car, problem):
 def test_rows_outside_are_neither_started_from_nor_passed(problem):
     inside = np.ones(STEPS + 1, dtype=np.bool_)
     inside[700:800] = False
-    first, steps = problem.starts(inside)
+    first, steps = problem.list_windows(inside)
     for a, row in zip(first, steps, strict=True):
         assert inside[a : a + row.max() + 1].all()
-    assert len(first) < len(problem.starts()[0])
+    assert len(first) < len(problem.list_windows()[0])
 
 
 def test_a_window_does_not_pass_a_gap(problem):
     t = problem.samples.t + np.where(np.arange(STEPS + 1) >= 1000, 0.5, 0.0)
-    first, steps = replace(problem, samples=replace(problem.samples, t=t)).starts()
+    first, steps = replace(
+        problem, samples=replace(problem.samples, t=t)
+    ).list_windows()
     assert not ((first < 1000) & (first + steps.max(axis=1) >= 1000)).any()
 
 
 def test_predictions_are_seen_from_where_the_tracked_body_is(car, problem):
-    first, steps = problem.starts()
+    first, steps = problem.list_windows()
     values = np.array([DELAY, 0.2, -0.1, 0.3])
     base, _ = problem.predict(car, values, first, steps)
     seen, _ = replace(problem, mounted=True).predict(car, values, first, steps)
@@ -142,7 +146,7 @@ def test_predictions_are_seen_from_where_the_tracked_body_is(car, problem):
 def test_nothing_free_leaves_the_model(car, problem):
     fixed = replace(problem, fixed=np.array([DELAY]))
     found = fit_to_predictions(
-        fixed, car, np.zeros((6, 4), dtype=np.bool_), NOTHING_FREE
+        fixed, car, np.zeros((6, 4), dtype=np.bool_), NO_PARAMETERS
     )
     assert np.array_equal(found.model.coefficients, car.coefficients)
     assert np.sqrt(np.mean(found.residual**2)) < 0.005
@@ -162,8 +166,8 @@ def test_the_error_of_a_prediction_that_diverged_is_infinite_and_none_is_left_ou
 def test_delays_alone_move_to_later_stamps():
     names = ("latency", "throttle.delay", "throttle.dead")
     start = np.array([0.1, 0.2, 0.3])
-    inputs = Inputs(names, start, np.ones(3), start - 0.1, start + 0.1)
-    later = inputs.shifted(0.05)
+    parameters = Parameters(names, start, np.ones(3), start - 0.1, start + 0.1)
+    later = parameters.shift_stamps(0.05)
     assert later.start == pytest.approx([0.05, 0.15, 0.3])
     assert later.low == pytest.approx([-0.05, 0.05, 0.2])
     assert later.high == pytest.approx([0.15, 0.25, 0.4])
