@@ -120,7 +120,17 @@ def identify(
 
 
 def list_stages() -> tuple[Stage, ...]:
-    """Returns the stages in order; each uses the findings of those before it."""
+    """Returns the stages in order; each uses the findings of those before it.
+
+    | stage | exact drive | noisy drive |
+    |---|---|---|
+    | `fit_terms` | least squares (Eq. 1) | predictions choose effects and terms |
+    | `prune_terms` | Eq. 2, and a refit | nothing |
+    | `refine_model` | nothing | predictions adjust all parameters, then Eq. 2 |
+    | `prefer_textbook` | if it predicts better | if it predicts better |
+
+    The other stages do the same for both.
+    """
     return (
         repair_drive,
         estimate_timing,

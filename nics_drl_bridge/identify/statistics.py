@@ -89,7 +89,8 @@ def minimise_robustly(
     Errors far above `size` count by their magnitude, not by their square. Each step is that of
     Levenberg and Marquardt, with the damping of Nielsen (1999), by the normal equations: a
     decomposition of the Jacobian (n, P) would take longer than to compute it. A step beyond a bound
-    ends there. Raises ValueError if the residual of the start is not finite.
+    ends there. The residual is computed at most `evaluations` times. Raises ValueError if the
+    residual of the start is not finite.
     """
     low, high = bounds
     theta = start
@@ -102,6 +103,7 @@ def minimise_robustly(
     left = evaluations - 1
     while left > 0 and damping < most:
         slopes = jacobian(theta)
+        # The loss of an error e has the slope weight * e, and the curvature weight^3.
         weight = 1.0 / np.hypot(1.0, rest / size)
         gradient = slopes.T @ (weight * rest)
         normal = (slopes * weight[:, None] ** 3).T @ slopes
