@@ -253,12 +253,14 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             reward = 0.0
             for term in terms.values():
                 reward += term
+            terminated = bool(self.ended.item(0))
         else:
             reward = float(total(sum(terms.values(), np.zeros(self.robots))))
+            terminated = bool(self.ended.all())
         info["reward_terms"] = terms
         if self.render_mode == "human":
             self.render()
-        return observation, reward, all(self.ended.tolist()), False, info
+        return observation, reward, terminated, False, info
 
     @guard_call
     def advance(self, action: AnyArray) -> tuple[Singles, Terms, Info]:
