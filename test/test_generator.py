@@ -244,7 +244,7 @@ def test_a_name_that_is_no_model_is_refused(name, said, tmp_path):
         open_model(name)
     with pytest.raises(ModelError, match="nothing: no such folder; make one with"):
         load_model(tmp_path / "nothing")
-    with pytest.raises(ModelError, match=f"{tmp_path.name}: holds no {MODEL_FILE}"):
+    with pytest.raises(ModelError, match=f"{tmp_path.name}: contains no {MODEL_FILE}"):
         load_model(tmp_path)
 
 

@@ -153,10 +153,10 @@ def test_without_the_gate_failures_are_found_clustered_and_replayed(tmp_path):
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        ("--seed 3", "'seed' was 1000000 and is 3"),
-        ("--episodes 7", "'episodes' was 4 and is 7"),
-        ("--randomisation strong", "'randomisation' was 'mild' and is 'strong'"),
-        ("--control no_gate", "'control' was '' and is 'no_gate'"),
+        ("--seed 3", "'seed' was 1000000 and is now 3"),
+        ("--episodes 7", "'episodes' was 4 and is now 7"),
+        ("--randomisation strong", "'randomisation' was 'mild' and is now 'strong'"),
+        ("--control no_gate", "'control' was '' and is now 'no_gate'"),
         ("--replay 999999", "--replay 999999: the run has the seeds 1000000 to"),
     ],
 )

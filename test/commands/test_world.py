@@ -180,7 +180,7 @@ def test_field_distances_height_and_shapes_are_taken_from_options_or_the_file(tm
     ("words", "said"),
     [
         ("import my.world --bounds -1 -1 1 1", "key 'obstacles.0.at.1'.* is outside"),
-        ("import my.world --height 0.51", "stands at a height of 0.51 m"),
+        ("import my.world --height 0.51", "is at height 0.51 m"),
         ("import my.usd", "my.usd: unknown kind of file; give one of .world"),
         ("import hall.yaml", "hall.yaml: "),
         ("draw arenna", "unknown world 'arenna'; did you mean 'arena'"),

@@ -76,7 +76,7 @@ def test_a_task_from_a_file_passes_the_checker_and_steps_alike_alone_and_in_a_ve
             None,
             "make it with model.robot and model.lidar",
         ),
-        (Navigation(DIRECT, lidar()), {"goal_radius": 1.0}, "already exists"),
+        (Navigation(DIRECT, lidar()), {"goal_radius": 1.0}, "is already made"),
     ],
 )
 def test_a_wrong_task_gives_one_sentence(task, options, sentence):

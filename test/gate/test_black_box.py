@@ -190,7 +190,7 @@ def test_a_record_that_is_none_of_the_gate_is_one_sentence(tmp_path, change):
 def test_very_many_records_or_brackets_are_refused_at_once(tmp_path):
     path = tmp_path / "stop.jsonl"
     for text, words in (
-        ("[" * 3_000_000, "holds 3000000 values"),
+        ("[" * 3_000_000, "contains 3000000 values"),
         ("[" * 5000, "not JSON"),
     ):
         path.write_text(text)

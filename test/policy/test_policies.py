@@ -186,7 +186,7 @@ def test_other_worlds_than_before_are_refused_unless_an_episode_begins():
     policy = counting()
     policy.act(np.zeros((2, 5), np.float32))
     with pytest.raises(
-        ConfigError, match=r"of \(2,\) worlds, .* of \(3,\); reset the policy"
+        ConfigError, match=r"has \(2,\) worlds, .* \(3,\); reset the policy"
     ):
         policy.act(np.zeros((3, 5), np.float32))
 

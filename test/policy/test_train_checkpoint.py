@@ -50,6 +50,6 @@ def test_the_state_of_another_env_is_refused():
     other = vector(6)
     one.reset(seed=0)
     with pytest.raises(
-        ConfigError, match=r"of shape .5, .*, but this env's is .* of shape .6, "
+        ConfigError, match=r"of shape .5,.*, but this env's is .* of shape .6,"
     ):
         restore(other, snapshot(one))

@@ -147,7 +147,7 @@ def test_a_misspelt_task_leaves_no_folder_that_refuses_the_right_one(
         (
             'memory["goal"])}',
             'memory["gaol"])}',
-            "mine.py:17, in reward: KeyError('gaol'); mend",
+            "mine.py:17, in reward: KeyError('gaol'); correct",
         ),
     ],
 )

@@ -235,7 +235,7 @@ def spoil(columns):
         ("{time: sec, in: log.csv}", "of 50 rows each"),
         ("command: {v: vv}", "did you mean 'v'?"),
         ('command: {v: "other.csv:v"}', "has no 'other.csv'"),
-        ("command: {v: {from: v, time: later}}", "a `clock:`"),
+        ("command: {v: {from: v, time: later}}", "separate `clock:`"),
         ("command: {v: {from: v, when: {w: 7}}}", "w is 7.0"),
         ("command: {v: {from: count, unit: rpm}}", "{from: count, unit: ticks, "),
         ("command: {v: back}", "{from: back, unit: ticks, "),

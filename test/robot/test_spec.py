@@ -122,11 +122,11 @@ state: [{name: a, unit: m/s, min: -1, max: 1, twist: vx}, {name: b, unit: m/s, m
   -> two states are the same component
 state: [{name: a, unit: rad, min: -1, max: 1, twist: vx}]
   -> state 'a' is vx of the twist, so its unit is m/s
-name: ../../evil -> name '../../evil': it names files
-name: a\\b -> leave out .., / and
+name: ../../evil -> name '../../evil': it is used in file names
+name: a\\b -> remove .., / and
 angular_is: sideways -> 'turn_rate' or 'steering'
 footprint_radius: 0.0 -> greater than or equal to 0.001
-footprint_radius: 30.0 -> reaches 30 m from base_link, at most 10 m can be
+footprint_radius: 30.0 -> reaches 30 m from base_link, the maximum is 10 m
 parameters: {track: -0.3} -> track -0.3: must be more than 0
 parameters: {wheel_radius: 0.0} -> wheel_radius 0: must be more than 0
 parameters: {wheel_lag: 0.0} -> wheel_lag 0: must be more than 0
@@ -137,7 +137,7 @@ command: [] -> number of entries must be at least 1
 command: [{name: push, unit: m/s, min: -1, max: 1, cmd_vel: linear.x}, {name: turn, unit: m/s, min: -1, max: 1, cmd_vel: linear.x}]
   -> two commands share one field
 state: [{name: push, unit: m/s, min: 0, max: 1, cmd_vel: linear.x}] -> unknown key 'state.0.cmd_vel'
-state: [{name: push, unit: m, min: 0, max: 1}] -> a name of its own
+state: [{name: push, unit: m, min: 0, max: 1}] -> a unique name
 state: [{name: a, unit: m, min: 1, max: 1}] -> min must be less than max of variable 'a'
 state: [{name: a, unit: m, min: 0, max: 1, follows: b}] -> follows 'b', which is not a command
 state: [{name: A b, unit: m, min: 0, max: 1}] -> state.0.name
@@ -147,7 +147,7 @@ footprint: [[0.1, 0.0], [0.0, a], [0.0, 0.0]] -> footprint.1.1
 footprint: [[0.1, 0.1], [-0.1, -0.1], [0.1, -0.1], [-0.1, 0.1]] -> cross or touch
 footprint: [[0.1, 0.0], [0.2, 0.0], [0.1, 0.0]] -> cross or touch
 footprint: [[0.1, 0.0], [0.1, 0.0], [0.0, 0.1]] -> cross or touch
-footprint: [[0.1, 0.1], [-0.1, 0.1], [0.0, -0.1]] -> leave footprint_radius out
+footprint: [[0.1, 0.1], [-0.1, 0.1], [0.0, -0.1]] -> remove footprint_radius
 """  # noqa: E501
 
 

@@ -109,7 +109,7 @@ def test_a_polyline_stands_on_its_own_ground_and_may_hang_upside_down():
     "solid", [Cylinder(0.1, 1.0), Capsule(0.1, 1.0), Prism(L, 1.0)]
 )
 def test_what_leans_and_is_round_or_has_an_outline_has_no_shape(solid):
-    with pytest.raises(ShapelessError, match="leans"):
+    with pytest.raises(ShapelessError, match="tilted"):
         section(solid, at(pitch=0.3), 0.0)
 
 
