@@ -52,15 +52,19 @@ def test_every_node_starts_in_its_namespace_and_ends_in_order(launch, meet, doma
     remap = {"scan": "lidar/front"}
     started = {node: launch(node, domain_id, "robot", remap) for node in NODES}
 
+    def list_topics():
+        return {name for name, _ in peer.node.get_topic_names_and_types()} - ABSOLUTE
+
     def running():
         names = dict(peer.node.get_node_names_and_namespaces())
         return scans and all(names.get(node) == "/robot" for node in NODES)
 
+    wanted = {"/robot/cmd_vel", "/robot/cmd_vel_raw", "/robot/odom"}
     peer.until(running, "all nodes")
-    topics = {name for name, _ in peer.node.get_topic_names_and_types()} - ABSOLUTE
+    peer.until(lambda: wanted <= list_topics(), "the topics of commands and odometry")
+    topics = list_topics()
     found = peer.node.get_service_names_and_types()
     services = {name for name, _ in found if not name.startswith("/peer_")}
-    assert {"/robot/cmd_vel", "/robot/cmd_vel_raw", "/robot/odom"} <= topics
     assert "/robot/scan" not in topics
     assert all(name.startswith("/robot/") for name in topics | services)
     for node, running_node in started.items():
