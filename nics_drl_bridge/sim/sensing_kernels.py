@@ -3,7 +3,8 @@
 At the end of each period:
 
 1. `measure_odometry` adds the displacement measured by the wheels, and noise, to the
-   odometry pose. It also records true pose and twist in the ring buffer `State.past`.
+   odometry pose, in the ring buffer `State.past`. `record_truth` keeps the true pose and
+   twist beside it.
 2. `scan_or_wait` scans worlds with a delayed or skewed scan immediately. The other
    worlds wait for `scan_together`, which is faster per scan.
 3. `distort_scans` applies the faults of each robot's lidar.

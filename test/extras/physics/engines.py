@@ -29,6 +29,7 @@ class Engine:
     encoder_error: float  # of a pose by encoders after two seconds [m, rad]
     skid_error: float  # of the turn rate of wheels that skid, relative
     slip_error: float  # of a motion without slip beside the model's, relative
+    wall_error: float  # of where a wall stops a robot [m]
 
 
 ENGINES = (
@@ -44,6 +45,7 @@ ENGINES = (
         encoder_error=0.02,
         skid_error=0.1,
         slip_error=0.07,
+        wall_error=0.015,
     ),
     Engine(
         name="MuJoCo",
@@ -57,6 +59,7 @@ ENGINES = (
         encoder_error=0.01,
         skid_error=0.04,
         slip_error=0.05,
+        wall_error=0.01,
     ),
 )
 
