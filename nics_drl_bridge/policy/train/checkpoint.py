@@ -16,7 +16,7 @@ from nics_drl_bridge.files import check_sealed, seal, write_bytes
 from nics_drl_bridge.lidar.arrays import AnyArray
 from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 
-FORMAT = "nics_drl_bridge/checkpoint/4"
+FORMAT = "nics_drl_bridge/checkpoint/5"
 MOST_BYTES = 4 * 2**30  # maximum size of a file, which includes SAC's whole buffer
 
 
