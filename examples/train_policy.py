@@ -7,7 +7,7 @@ from nics_drl_bridge.policy.train.progress import Progress
 from nics_drl_bridge.policy.train.settings import chosen_settings
 from nics_drl_bridge.report.pictures import Point, draw_training_curve
 
-STEPS = 120_000  # half a minute; `nics demo` takes 800,000
+STEPS = 120_000  # half a minute; `nics demo` takes 400,000
 OUT = Path("runs/example")
 
 
