@@ -89,7 +89,9 @@ class Engine:
         self._client = self._bullet.connect(self._bullet.DIRECT)
         self.setGravity(0.0, 0.0, -GRAVITY)
         self.setPhysicsEngineParameter(
-            fixedTimeStep=physics.timestep, deterministicOverlappingPairs=1
+            fixedTimeStep=physics.timestep,
+            deterministicOverlappingPairs=1,
+            enableConeFriction=0,
         )
 
     def __getattr__(self, name: str) -> Any:
