@@ -32,7 +32,7 @@ from nics_drl_bridge.identify.signals import find_speed_index
 from nics_drl_bridge.identify.yardstick import probe_structure
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.kernels import MAX_ORDER
-from nics_drl_bridge.robot.kinds import compute_steady_twist, textbook
+from nics_drl_bridge.robot.kinds import compute_steady_twist, slips, textbook
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec, StateVariable
 from nics_drl_bridge.robot.taylor import TaylorModel, evaluate, list_exponents
 
@@ -92,8 +92,10 @@ class Library:
     def _define(self, model: TaylorModel) -> TaylorModel:
         """Drops lateral motion that is noise; an inferred speed is that along x."""
         coefficients = model.coefficients.copy()
-        slips = any(variable.twist == "vy" for variable in self.spec.state)
-        if not (self.spec.moves_sideways or slips):
+        slips_sideways = slips(self.spec) or any(
+            variable.twist == "vy" for variable in self.spec.state
+        )
+        if not (self.spec.moves_sideways or slips_sideways):
             coefficients[VY] = 0.0
         speed = find_speed_index(self.spec)
         if self.kind is Kind.FOLLOWER and speed is not None:
