@@ -27,7 +27,7 @@ pytestmark = pytest.mark.ros
 
 CAR = load_robot("ackermann")
 LONG_S = 180.0
-FAST = ("--duration", 25, "--use-sim-time", "--namespace", "bot")
+FAST = ("--duration", 40, "--use-sim-time", "--namespace", "bot")
 SHARE_OF_PATH = 0.1
 
 
