@@ -58,7 +58,7 @@ def messages(session: nox.Session) -> None:
     """Build message packages without wheels, and run the tests that need them in .venv."""
     build_messages(session)
     tests = [
-        "test/nodes/test_device_node.py",
+        "test/nodes/test_simulator_node.py",
         "test/nodes/simulation_interfaces",
         "test/nodes/test_map_to_odom.py",
         "test/nodes/test_follow_path.py",

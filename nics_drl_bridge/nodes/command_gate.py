@@ -70,16 +70,25 @@ REFUSED = (
 
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     """Declare and read a gate's parameters, and log doubts. Raises ConfigError for a bad value."""
-    for name in sorted(parameters.SPLIT.keys() & qos.get_given_values(node).keys()):
+    given = qos.get_given_values(node)
+    for name in sorted(parameters.SPLIT.keys() & given.keys()):
         raise ConfigError(f"parameter {name!r}: is now {parameters.SPLIT[name]}.")
-    file = str(runner.declare_row(node, parameters.LIMITS))
+    scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
+    rules = parameters.list_gate_rules(1.0 / model.control_period, scan_age)
+    for row in (*rules, *parameters.list_gate_rows()):
+        runner.declare_row(node, row)
+    file = runner.get_text(node, parameters.LIMITS.name)
     limits = load_limits(file, model.robot) if file else None
+    values = {row.name: node.get_parameter(row.name).value for row in rules}
+    for name in parameters.RULES_IN_SECONDS:
+        values[f"{name}_s"] = values.pop(name)
     config = make_gate_config(
         model,
         limits,
-        _declare_shield(node, model, limits, file),
+        _read_shield(node, model, limits, file),
         simulated=runner.get_flag(node, SIM_TIME),
-        **_declare_rules(node, model),
+        odom_rate_declared="odom_rate" in given,
+        **values,
     )
     node.add_on_set_parameters_callback(partial(_keep_clock, config.simulated))
     require_possible(config)
@@ -101,20 +110,9 @@ def _keep_clock(simulated: bool, parameters: list[Parameter]) -> SetParametersRe
     return SetParametersResult(successful=True)
 
 
-def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
-    scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
-    rules: dict[str, Any] = {
-        "odom_rate_declared": "odom_rate" in qos.get_given_values(node)
-    }
-    for row in parameters.list_gate_rules(1.0 / model.control_period, scan_age):
-        field = f"{row.name}_s" if row.name in parameters.RULES_IN_SECONDS else row.name
-        rules[field] = runner.declare_row(node, row)
-    return rules
-
-
-def declare_black_box(node: Node) -> Path:
-    """Declare the folder for recordings of stops; return its subfolder for the node's namespace."""
-    folder = str(runner.declare_row(node, parameters.BLACK_BOX))
+def find_black_box(node: Node) -> Path:
+    """Return the folder for recordings of stops of a node in its namespace."""
+    folder = runner.get_text(node, parameters.BLACK_BOX.name)
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     # A gate in another namespace must not remove its files.
     return (Path(folder) if folder else home / "black_box") / str(
@@ -122,17 +120,15 @@ def declare_black_box(node: Node) -> Path:
     ).strip("/")
 
 
-def _declare_shield(
+def _read_shield(
     node: Node, model: SimulatorModel, limits: Limits | None, file: str
 ) -> ShieldConfig | None:
-    on = runner.declare_row(node, parameters.SHIELD)
     values = {}
     for row in parameters.SHIELD_NUMBERS:
-        value = float(runner.declare_row(node, row))
-        name = row.name.removeprefix("shield_")
+        value = runner.get_number(node, row.name)
         if not math.isnan(value):
-            values[name] = value
-    if not on:
+            values[row.name.removeprefix("shield_")] = value
+    if not runner.get_flag(node, parameters.SHIELD.name):
         node.get_logger().warning("the shield is off: obstacles do not stop the robot")
         return None
     config, sentence = shield_config(model, limits, file, values)
@@ -173,7 +169,7 @@ class CommandGate(qos.BridgeNode):
         self._sensors = model.sensors
         self._state = begin(self._config)
         self._log = GateLog(
-            self._config, declare_black_box(self), model.robot.name, logger
+            self._config, find_black_box(self), model.robot.name, logger
         )
         if not self._config.e_stop_required:
             risk = "the robot moves even if e_stop was never received. That is for simulations"
@@ -181,9 +177,8 @@ class CommandGate(qos.BridgeNode):
         if self._config.shield is not None:
             shield.warm_up()
         scan_motion.warm_up(self._config)
-        self._stamped = bool(runner.declare_row(self, parameters.make_stamped_row()))
-        runner.declare_row(self, parameters.FOREIGN)
-        self._frame = str(runner.declare_row(self, parameters.ROBOT_FRAME))
+        self._stamped = runner.get_flag(self, parameters.STAMPED)
+        self._frame = runner.get_text(self, parameters.ROBOT_FRAME.name)
         fault = parameters.find_frame_fault(
             self.get_parameters_by_prefix("").values(), parameters.ROBOT_FRAME.name
         )
@@ -195,8 +190,7 @@ class CommandGate(qos.BridgeNode):
         self._listen()
         runner.call_periodically(self, PERIOD_S, self._tick)
         runner.diagnose(self, "gate", self._look)
-        priority = runner.declare_row(self, parameters.PRIORITY)
-        refused = take_priority(priority)
+        refused = take_priority(self.get_parameter(parameters.PRIORITY.name).value)
         if refused:  # once all threads exist
             logger.warning(refused)
 

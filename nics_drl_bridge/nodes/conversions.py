@@ -197,7 +197,7 @@ def map_from_ros(message: OccupancyGrid) -> GridMap:
     ):
         size = f"{info.height} x {info.width} of {info.resolution:g} m"
         raise ConfigError(
-            f"map: {cells.size} cells do not make {size}; look at who publishes it."
+            f"map: {cells.size} cells do not make {size}; check its publisher."
         )
     place = info.origin.position
     turn = info.origin.orientation

@@ -1,4 +1,4 @@
-"""A share of a core for a group of processes, by a control group of Linux; needs no ROS 2."""
+"""A share of a core for a group of processes, by a Linux control group; needs no ROS 2."""
 
 import os
 import time
@@ -12,9 +12,9 @@ POLL_S = 0.02
 
 
 class CoreShare(AbstractContextManager["CoreShare", None]):
-    """A control group that goes ahead of other programs, up to its share of a core.
+    """A control group with priority over other programs, up to its share of a core.
 
-    It is empty again when it ends. Raises OSError where this user may not make one.
+    Raises OSError if this user must not create one.
     """
 
     def __init__(self, root: Path = CONTROL_GROUPS) -> None:
@@ -35,7 +35,7 @@ class CoreShare(AbstractContextManager["CoreShare", None]):
         self._write("cgroup.procs", pid)
 
     def limit(self, cores: float) -> None:
-        """Limit what all processes together may take, as a fraction of a core."""
+        """Limit all processes together to a fraction of a core."""
         quota_us = round(cores * PERIOD_US)
         if self._is_v2:
             self._write("cpu.max", f"{quota_us} {PERIOD_US}")

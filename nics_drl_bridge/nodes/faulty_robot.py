@@ -1,4 +1,4 @@
-"""A robot's topics around a gate, whole or broken, published over DDS."""
+"""A robot's topics around a gate, intact or with faults, published over DDS."""
 
 import math
 import multiprocessing
@@ -44,9 +44,9 @@ def open_driver_context(domain_id: int | None) -> Context:
 
 
 def hear(domain_id: int | None, out: Connection) -> None:
-    """Send the time [s] at which the base hears each `cmd_vel`, its twist, and its stamp [ns].
+    """Report for each `cmd_vel` when it arrived [s], its twist, and when it was written [ns].
 
-    The stamp is that of its writing. Ends with the process that started it, even if that is killed.
+    Ends with the parent process, even if that is killed.
     """
     context = open_driver_context(domain_id)
     node = Node("base", context=context, start_parameter_services=False)
@@ -64,10 +64,10 @@ def hear(domain_id: int | None, out: Connection) -> None:
 
 
 class Robot(SpunNode):
-    """A robot's topics, whole or broken. It drives ahead as `cmd_vel` says, unless it is stuck.
+    """A robot's topics, intact or with faults. It follows `cmd_vel` unless it is stuck.
 
-    Commands are heard in a process of their own, as by a base: whoever publishes to a process that
-    was killed may be held up for a second by the middleware, and would hear the stop late.
+    Like a real base, a process of its own receives the commands. A process that publishes to a
+    killed one may be blocked by the middleware for a second, and would notice the stop late.
     """
 
     def __init__(
@@ -84,14 +84,13 @@ class Robot(SpunNode):
         """Publish the robot's topics.
 
         Args:
-            domain_id: of ROS; None for that of the environment.
+            domain_id: of ROS; by default the environment's.
             model: of the robot.
             twist: (3,) that its own policy commands.
-            policy: another node's policy commands; this robot's own is silent then.
-            relayed: commands go past the gate.
-            odom_hz: rate of odometry and estimate, a multiple of the lidar's; 0: what the model
-                needs.
-            skip: only one in so many scans, heartbeats and commands is sent.
+            policy: True if the policy of another node commands instead.
+            relayed: True if commands bypass the gate.
+            odom_hz: rate of odometry and estimate, a multiple of the lidar's; 0: the model's.
+            skip: send only every so many-th scan, heartbeat and command.
             sensors: quality of service of scan and odometry.
         """
         super().__init__("robot", context=open_driver_context(domain_id))
@@ -130,24 +129,23 @@ class Robot(SpunNode):
         self._now_ns = 0
         self._position = np.zeros(2)
         self.heard: list[tuple[float, Array]] = []  # times [s] and twists of `cmd_vel`
-        # When each topic last sent a good message [s], and the last message of each. That of
-        # `cmd_vel_raw` may be another node's policy's.
+        # When each topic last sent a good message [s], and its last message. That of `cmd_vel_raw`
+        # may come from the policy of another node.
         self.sent_s = dict.fromkeys(ALL, 0.0)
         self.last: dict[str, Any] = {}
         self.sent = dict.fromkeys(ALL, 0)  # number of messages
-        self.mend()
+        self.repair()
 
-    def mend(self) -> None:
-        """Make everything well again."""
-        self.silent: set[str] = set()  # topics that say nothing
+    def repair(self) -> None:
+        """Remove all faults."""
+        self.silent: set[str] = set()  # topics
         # alters messages by topic before they are sent
         self.change: dict[str, Callable[[Any], Any]] = {}
         self.stuck = False  # odometry shows no motion
-        self.republished = False  # the policy's last command is sent again and again
+        self.republished = False  # the policy's last command is repeated
         self.jump_ns = 0  # of all stamps
-        self.since_ns = (
-            0  # commands that were written before are not heard, on the system clock
-        )
+        # commands that were written before are ignored, on the system clock
+        self.since_ns = 0
 
     def _hear_policy(self, message: TwistStamped) -> None:
         if self._policy and not self.republished:
@@ -169,28 +167,30 @@ class Robot(SpunNode):
             ("odom", "base_link"),
             (1e-4,) * 4,
         )
-        self._say("odom", odometry)
-        self._say("odometry/filtered", odometry)
+        self._publish("odom", odometry)
+        self._publish("odometry/filtered", odometry)
         self._ticks += 1
         if self._ticks % self._every:
             return
         ranges = np.full(
             self._lidar.beams, 2.0 + 0.1 * np.sin(self._now_ns * 1e-9), np.float32
         )
-        self._say("scan", conversions.scan_to_ros(self._lidar, ranges, stamp, "laser"))
-        self._say("e_stop", Bool(data=False))
+        self._publish(
+            "scan", conversions.scan_to_ros(self._lidar, ranges, stamp, "laser")
+        )
+        self._publish("e_stop", Bool(data=False))
         if self._policy:
             if self.republished:
                 self._topics["cmd_vel_raw"].publish(self.last["cmd_vel_raw"])
         else:
             command = TwistStamped(twist=conversions.twist_to_ros(self._twist))
-            if "scan" in self.last:  # what a policy acts on is the scan that it got
+            if "scan" in self.last:  # a policy acts on the scan that it received
                 command.header.stamp = self.last["scan"].header.stamp
-            self._say("cmd_vel_raw", command)
+            self._publish("cmd_vel_raw", command)
         if self._relayed and "cmd_vel_raw" in self.last:
             self._past.publish(self.last["cmd_vel_raw"].twist)
 
-    def _say(self, name: str, message: Any) -> None:
+    def _publish(self, name: str, message: Any) -> None:
         if name in self.silent:
             return
         if name in self.change:
@@ -206,7 +206,7 @@ class Robot(SpunNode):
         self._topics["e_stop"].publish(Bool(data=True))
 
     def until(self, done: Callable[[], object], seconds: float) -> bool:
-        """Live on until something is the case; return False if it does not come to be in time."""
+        """Keep publishing until a condition holds; return False if it does not in time."""
 
         def is_done() -> object:
             while self._ear.poll():
@@ -218,11 +218,11 @@ class Robot(SpunNode):
         return super().until(is_done, seconds)
 
     def call(self, service: str) -> Trigger.Response:
-        """Ask the gate for something."""
+        """Call a service of the gate."""
         return self.call_service(Trigger, f"command_gate/{service}", PATIENCE_S)
 
     def listeners(self) -> int:
-        """Return the number of listeners to its scans."""
+        """Return the number of subscribers of its scans."""
         return int(self._topics["scan"].get_subscription_count())
 
     @property
@@ -231,24 +231,24 @@ class Robot(SpunNode):
         return bool(self.heard) and bool(self.heard[-1][1].any())
 
     def drive(self, patience_s: float = PATIENCE_S, phase_s: float = 0.0) -> None:
-        """Arm the gate and drive, so that a fault finds the robot in motion.
+        """Arm the gate and drive, so that a fault is injected into a moving robot.
 
-        A busy machine may hold up this process itself, which the gate takes for a fault. Raises
-        NoMotionError if the robot is not told to move, or not any more.
+        On a busy machine this process itself may stall, which the gate takes for a fault. Raises
+        NoMotionError if the robot is not commanded to move.
         """
-        self.mend()
+        self.repair()
         self.until(lambda: False, 3 * PERIOD_S)  # of good data
         end = time.monotonic() + patience_s
         while not self.moves:
             if time.monotonic() > end:
-                raise NoMotionError(f"not within {patience_s} s: motion")
+                raise NoMotionError(f"the robot did not move within {patience_s:g} s")
             if not self._relayed:
                 self._arm()
             self.until(lambda: self.moves, min(MOTION_S, patience_s))
         self.until(lambda: False, 0.5 + phase_s)
         if not self.moves or time.monotonic() - self.heard[-1][0] > RECENT_S:
             raise NoMotionError(
-                "the robot was not being told to move when it was to be broken"
+                "the robot stood still when the fault was to be injected"
             )
 
     def _arm(self) -> None:
@@ -260,7 +260,7 @@ class Robot(SpunNode):
 
         if not self.until(is_armed, PATIENCE_S):
             raise NoMotionError(
-                f"not within {PATIENCE_S} s: {self.call('arm').message}"
+                f"the gate did not arm within {PATIENCE_S:g} s: {self.call('arm').message}"
             )
 
     def close(self) -> None:

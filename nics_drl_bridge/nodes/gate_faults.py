@@ -1,9 +1,9 @@
-"""Faults around a gate of real processes, and by when each must have stopped the robot.
+"""Faults injected around a gate, and how soon each must stop the robot.
 
-The gate, and for some faults the policy, are processes of their own, as on a vehicle; this one
-publishes what a robot publishes and breaks it while the robot is told to move. The time counts from
-the last good datum before the fault, or from the fault itself where it is an event, to the arrival
-of a zero on `cmd_vel`.
+As on a vehicle, the gate has its own process, and for some faults the policy, too. This process
+publishes a robot's topics and corrupts them while the robot drives. The time counts from the last
+good datum before the fault, or from the fault itself if it is an event, until a zero arrives on
+`cmd_vel`.
 """
 
 import itertools
@@ -49,7 +49,7 @@ MAX_IDLE = 3  # attempts in a row to inject a fault into a robot that moves
 
 @dataclass(frozen=True)
 class Around:
-    """What an injection can break: the robot, and the processes of policy and gate."""
+    """What an injection can affect: the robot, and the processes of policy and gate."""
 
     robot: Robot
     policy: NodeProcess | None
@@ -63,39 +63,41 @@ Change = Callable[[Any, Any, int], Any]
 
 @dataclass(frozen=True)
 class Fault:
-    """A way in which something breaks."""
+    """A fault, and how it is injected."""
 
-    limit_s: float  # time by which the robot must have been told to stop
-    inject: Injection | Sequence[Injection]  # breaks it; of several, one
-    # topic whose last good datum the limit counts from; empty for the fault itself
+    limit_s: float  # within which a zero must follow
+    inject: Injection | Sequence[Injection]  # one of several is drawn
+    # topic from whose last good datum the limit counts; empty: from the fault itself
     since: str = ""
-    policy: bool = False  # it needs the policy's process
-    # only the first command after the fault must be a zero; the robot may drive on then
+    policy: bool = False  # it needs a process of the policy
+    # only the first command after the fault must be zero; after it, the robot may drive on
     first_word: bool = False
 
 
 @dataclass(frozen=True)
 class Injected:
-    """What a fault led to."""
+    """Outcome of an injection."""
 
     time_s: float  # from the last good datum to zero; inf for never
     after_s: float  # from the fault to zero
-    unsafe: int  # commands that must not have been
+    unsafe: int  # number of commands that should not have been sent
 
 
 @dataclass(frozen=True)
 class Setup:
-    """A gate, or nothing in its place, and a robot around it."""
+    """A gate, or none, and the robot around it."""
 
     model: str
     limits: str
-    twist: Array  # (3,) that drives the robot, unless the policy does
+    twist: Array  # (3,) commanded to the robot, unless the policy does
     low: Array  # (3,) limits of `cmd_vel`
     high: Array
-    folder: Path  # for logs: a process gets a folder there, by its first injection
+    folder: (
+        Path  # for logs; each process has a subfolder named after its first injection
+    )
     policy: str = ""  # by default that of `policy_node`
     goal: tuple[float, float] = (1e6, 0.0)  # of the policy [m]
-    gated: bool = True  # False: commands are relayed past the gate
+    gated: bool = True  # False: commands bypass the gate
     parameters: Mapping[str, Any] = field(default_factory=dict)  # of the gate
     patience_s: float = PATIENCE_S
 
@@ -105,7 +107,7 @@ def _silence(*topics: str) -> Injection:
 
 
 def _change(topic: str, change: Change) -> Injection:
-    """Change each further message of a topic."""
+    """Change each subsequent message of a topic."""
 
     def inject(around: Around) -> None:
         held = around.robot.last.get(topic)
@@ -126,7 +128,7 @@ def _replace_command(x: float) -> Injection:
 
 
 def _shift_stamps(topic: str, off_s: float, growing: bool = False) -> Injection:
-    """Move a topic's stamps; further with each message, if wanted."""
+    """Shift a topic's stamps; by more with each message, if `growing`."""
 
     def change(message: Any, _: object, number: int) -> Any:
         off_ns = round(off_s * (number if growing else 1) * NS_PER_S)
@@ -138,7 +140,7 @@ def _shift_stamps(topic: str, off_s: float, growing: bool = False) -> Injection:
 
 
 def _freeze(topic: str, stamped: bool = False) -> Injection:
-    """Repeat the last good message, as a frozen driver does; with the stamp of now if wanted."""
+    """Repeat the last good message like a frozen driver, with current stamps if `stamped`."""
 
     def change(message: Any, held: Any, _: int) -> Any:
         if stamped:
@@ -149,7 +151,7 @@ def _freeze(topic: str, stamped: bool = False) -> Injection:
 
 
 def _alternate_scans(around: Around) -> None:
-    """Show two pictures in turn, as of a driver that swaps two buffers."""
+    """Alternate between two scans, like a driver that swaps two buffers."""
     shown = [around.robot.last["scan"].ranges]
 
     def change(message: LaserScan, _: object, number: int) -> LaserScan:
@@ -162,7 +164,7 @@ def _alternate_scans(around: Around) -> None:
 
 
 def _freeze_but_one(message: LaserScan, held: LaserScan, number: int) -> LaserScan:
-    """Show the same picture, in which one beam flickers."""
+    """Repeat a scan in which one beam flickers."""
     message.ranges = [held.ranges[0] + 1e-3 * number, *held.ranges[1:]]
     return message
 
@@ -178,7 +180,7 @@ def _clear_scan(message: LaserScan, *_: object) -> LaserScan:
 
 
 def _move_odometry(x: float, y: float) -> Injection:
-    """Show the robot elsewhere by odometry from now on."""
+    """Shift the pose of odometry from now on."""
 
     def change(message: Odometry, *_: object) -> Odometry:
         message.pose.pose.position.x += x
@@ -193,7 +195,7 @@ def _jump(seconds: int) -> Injection:
 
 
 def _signal(how: signal.Signals, republished: bool = False) -> Injection:
-    """End or stop the policy; somebody may go on with its last command."""
+    """Send the policy a signal; its last command may be republished."""
 
     def inject(around: Around) -> None:
         if around.policy is not None:
@@ -204,10 +206,10 @@ def _signal(how: signal.Signals, republished: bool = False) -> Injection:
 
 
 def _freeze_gate(around: Around) -> None:
-    """Stop the gate itself for a while.
+    """Freeze the gate itself for a while.
 
-    What it wrote before does not count, although the middleware, which stops with it, may send the
-    last command only when it goes on.
+    Commands that it wrote before do not count, although the middleware, which freezes with it, may
+    send the last one only afterwards.
     """
     if around.gate is not None:
         os.kill(around.gate.pid, signal.SIGSTOP)
@@ -272,7 +274,7 @@ FAULTS: dict[str, Fault] = {
 
 
 def inject(setup: Setup, around: Around, name: str, number: int) -> Injected:
-    """Drive, break something in a way and at a phase drawn from a number, and watch the gate."""
+    """Drive, inject a fault with a variant and a phase drawn from a number, and watch the gate."""
     fault = FAULTS[name]
     robot = around.robot
     ways = [fault.inject] if callable(fault.inject) else fault.inject
@@ -297,7 +299,7 @@ def inject(setup: Setup, around: Around, name: str, number: int) -> Injected:
 def judge_commands(
     fault: Fault, heard: Sequence[tuple[float, Array]], good_s: float, broken_s: float
 ) -> tuple[float, int]:
-    """Return when the robot was told to stop for good [s], and how many commands came too late.
+    """Return when the robot was finally commanded to stop [s], and how many commands came too late.
 
     `heard` holds times [s] and twists of commands since the fault.
     """
@@ -313,7 +315,7 @@ def judge_commands(
 
 
 class Surroundings(ExitStack):
-    """A robot, and the processes around it, which are started again once they have ended."""
+    """A robot and the processes around it, which are restarted when they have ended."""
 
     def __init__(self, setup: Setup, name: str, tell: Callable[[str], None]) -> None:
         super().__init__()
@@ -336,7 +338,7 @@ class Surroundings(ExitStack):
         self._policy: NodeProcess | None = None
 
     def prepare(self, folder: Path) -> Around:
-        """Start what is missing, with its logs in a folder; return what an injection can break."""
+        """Start missing processes, with their logs in a folder; return what can be affected."""
         if self._setup.gated and not _is_alive(self._gate):
             if self._gate is not None:
                 self._tell(f"{self._name}: the gate has ended, and another is started")
@@ -350,7 +352,7 @@ class Surroundings(ExitStack):
         return Around(self._robot, self._policy, self._gate)
 
     def give_up_policy(self, error: Exception) -> None:
-        """Have another policy started: one that was killed may leave DDS ill."""
+        """Have another policy started: a killed one may leave DDS in a bad state."""
         self._tell(f"{self._name}: {error}. {_read_log(self._policy)}")
         self._policy = None
 
@@ -364,7 +366,7 @@ def inject_all(
 ) -> Iterator[Injected]:
     """Yield an injection of a fault for each number; fewer if the robot does not move.
 
-    `tell` gets a line if an attempt fails. A policy or a gate that has ended is started again.
+    `tell` gets a line if an attempt fails. A policy or a gate that has ended is restarted.
     """
     with Surroundings(setup, name, tell) as surroundings:
         for number in numbers:
@@ -403,7 +405,7 @@ def _start_gate(setup: Setup, folder: Path, domain_id: int) -> NodeProcess:
 
 
 def _is_alive(process: NodeProcess | None) -> bool:
-    """Let a process go on that was stopped; return False if it has ended."""
+    """Continue a process that was stopped; return False if it has ended."""
     if process is None:
         return False
     try:
@@ -421,14 +423,14 @@ def _read_log(policy: NodeProcess | None) -> str:
     return f"Another policy is started: {text[-LOG_CHARACTERS:]}"
 
 
-# faults that nothing but the gate answers, to show that an injection can fail
+# faults that only the gate reacts to, to show that an injection can fail
 CONTROLS = ("scan_silent", "odom_silent", "nan_scan", "command_nan")
 
 
 def find_reach(robot: RobotSpec, limits: Limits) -> tuple[Array, Array]:
-    """Return the least and the greatest `cmd_vel` (3,) within limits.
+    """Return the minimum and the maximum `cmd_vel` (3,) within limits.
 
-    The turn rate of a car follows from both commands, so all of their corners count, and zeros.
+    The turn rate of a car follows from both commands, so all of their extremes count, and zeros.
     """
     ends = zip(limits.low, np.zeros_like(limits.low), limits.high, strict=True)
     twists = robot.to_cmd_vel(list(itertools.product(*ends)))
@@ -459,7 +461,7 @@ def _inject_kind(
 
 
 def choose_setup(protocol: Protocol, folder: Path) -> Setup:
-    """Return a gate and a robot that is told to move by half its limits."""
+    """Return a gate, and a robot that is commanded to move at half its limits."""
     robot = open_model(protocol.model).robot
     limits = load_limits(protocol.limits, robot)
     command = 0.1 * np.where(limits.high > 0.0, limits.high, limits.low)

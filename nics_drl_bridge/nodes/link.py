@@ -15,7 +15,6 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -26,7 +25,6 @@ from numpy.typing import NDArray
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
@@ -80,10 +78,12 @@ class Link:
             for number in ENDING:
                 if signal.getsignal(number) is signal.SIG_DFL:
                     signal.signal(number, lambda number, _: sys.exit(128 + number))
+        self._thread: threading.Thread | None = None  # of the executor, in real time
         self._context = open_context(domain_id=domain_id)
-        self._resources = Resources(self._context)
+        self._undo = contextlib.ExitStack()
+        self._undo.callback(self._context.try_shutdown)
         # Also applies if the link never begins or its owner fails to construct.
-        self._closing = weakref.finalize(self, _shut_down, self._resources)
+        self._closing = weakref.finalize(self, _shut_down, self._undo)
         try:
             overrides = [
                 Parameter(name, value=value)
@@ -96,11 +96,11 @@ class Link:
                 start_parameter_services=False,
                 parameter_overrides=overrides,
             )
-            self._resources.node = self.node
+            self._undo.callback(self.node.destroy_node)
             self._began_s = time.monotonic()
             self._executor = SingleThreadedExecutor(context=self._context)
             self._executor.add_node(self.node)
-            self._resources.executor = self._executor
+            self._undo.callback(self._executor.shutdown, timeout_sec=1.0)
             if stamped is None:
                 stamped = self.expects_stamped(command_topic, patience_s)
             # frame of the robot, in which commands are given; unknown until it is set
@@ -111,8 +111,9 @@ class Link:
                 self._kind, command_topic, qos.COMMAND
             )
             self._topic = self.commands.topic_name
-            self._timeout = CommandTimeout(self.commands, self._kind, command_timeout_s)
-            self._resources.timeout = self._timeout
+            self._timeout = CommandTimeout(
+                self._context, self.commands, self._kind, command_timeout_s
+            )
             INTERRUPTS.watch(self)
         except BaseException:
             self.close()
@@ -120,7 +121,7 @@ class Link:
 
     def wait_until(self, condition: Callable[[], Any], seconds: float) -> bool:
         """Wait until a condition holds, while callbacks run; False if it does not in time."""
-        if self._resources.thread is not None:
+        if self._thread is not None:
             return holds(condition, seconds, POLL_S)
         deadline = time.monotonic() + seconds
         while not condition():
@@ -150,14 +151,16 @@ class Link:
 
     def begin(self) -> None:
         """Let a thread run the callbacks; call it once all subscriptions exist."""
-        thread = threading.Thread(
+        self._thread = threading.Thread(
             target=_spin,
             args=(self._executor, self._timeout),
             daemon=True,
             name="dds_backend",
         )
-        self._resources.thread = thread
-        thread.start()
+        # Otherwise Python may exit while the thread is inside the middleware's library.
+        self._undo.callback(_join, self._thread)
+        self._undo.callback(self._context.try_shutdown)
+        self._thread.start()
 
     def send(self, twist: NDArray[np.float64], stamp_ns: int = 0) -> None:
         """Publish linear.x, linear.y, angular.z (3,); for NaN or inf, a zero and BackendError."""
@@ -253,7 +256,7 @@ class Link:
         left_s = deadline - time.monotonic()
         self.wait_until(lambda: not self.has_rivals(), left_s)
         self.check_alone()
-        self._resources.has_peers = True
+        self._undo.callback(self._timeout.end)  # before that, nothing was commanded
         gc.collect()  # now, because later it may take 0.1 s while the robot moves
 
     def close(self) -> None:
@@ -301,18 +304,6 @@ class Interrupts:
 INTERRUPTS = Interrupts()
 
 
-@dataclass
-class Resources:
-    """Resources that a link has opened so far, to be closed at its end."""
-
-    context: Context
-    node: Node | None = None
-    timeout: CommandTimeout | None = None
-    executor: SingleThreadedExecutor | None = None
-    thread: threading.Thread | None = None  # of the executor, in real time
-    has_peers: bool = False  # before that, nothing was commanded
-
-
 def _spin(executor: SingleThreadedExecutor, timeout: CommandTimeout) -> None:
     try:
         while executor.context.ok():
@@ -321,35 +312,30 @@ def _spin(executor: SingleThreadedExecutor, timeout: CommandTimeout) -> None:
     except Exception:  # another thread may have shut the context down meanwhile
         if executor.context.ok():
             raise
-    finally:
-        if executor.context.ok():  # after an error, since nothing would notice old data
-            timeout.end()
-            executor.context.try_shutdown()
+    finally:  # after an error too, since nothing would notice old data
+        timeout.end()
+        executor.context.try_shutdown()
 
 
-def _shut_down(opened: Resources) -> None:
-    # Otherwise Python may exit while a thread is inside the middleware's library.
+def _shut_down(undo: contextlib.ExitStack) -> None:
     with delay_interrupts():
-        if opened.context.ok():
-            if opened.timeout is not None and opened.has_peers:
-                opened.timeout.end()
-            opened.context.try_shutdown()
-        # Garbage collection may run this in any thread, including the link's own.
-        thread = opened.thread
-        is_own = thread is threading.current_thread()
-        if thread is not None and thread.is_alive() and not is_own:
-            thread.join(timeout=2.0)
-        if opened.executor is not None:
-            opened.executor.shutdown(timeout_sec=1.0)
-        if opened.node is not None:
-            opened.node.destroy_node()
+        undo.close()
+
+
+def _join(thread: threading.Thread) -> None:
+    # Garbage collection may run this in any thread, including the link's own.
+    if thread.is_alive() and thread is not threading.current_thread():
+        thread.join(timeout=2.0)
 
 
 class CommandTimeout:
     """Ends a command if its sender, which may have failed or hang, is silent beyond a limit [s]."""
 
     # It keeps no reference to the link, so that the link can be garbage-collected.
-    def __init__(self, publisher: Publisher, kind: Any, limit_s: float) -> None:
+    def __init__(
+        self, context: Context, publisher: Publisher, kind: Any, limit_s: float
+    ) -> None:
+        self._context = context
         self._publisher = publisher
         self._kind = kind
         self._limit_s = limit_s
@@ -369,8 +355,9 @@ class CommandTimeout:
             self._publisher.publish(self._kind())
 
     def end(self) -> None:
-        """Publish the last zero, and wait for its delivery."""
-        publish_last(self._publisher, self._kind())
+        """Publish the last zero and wait for its delivery, unless the context has ended."""
+        if self._context.ok():
+            publish_last(self._publisher, self._kind())
 
 
 def get_fingerprints(
@@ -493,5 +480,5 @@ def read_message(topic: str, read: Callable[[bytes], T], content: bytes) -> T:
     try:
         return read(content)
     except wire.UNREADABLE as error:
-        reason = f"a message can't be read ({error}); look at who publishes it."
+        reason = f"a message can't be read ({error}); check its publisher."
         raise BackendError(f"topic {topic!r}: {reason}") from None

@@ -1,7 +1,7 @@
-"""What the nodes of a vehicle take of this machine, and how soon they answer a scan.
+"""CPU, memory and scan-to-command latency of a vehicle's nodes on this machine.
 
-Middleware, policy and gate run as processes in a ROS domain of their own, where no robot hears
-them. A stand-in robot publishes scans and odometry at fixed rates, and follows `cmd_vel`.
+Middleware, policy and gate run as processes in a ROS domain of their own, where no robot receives
+their commands. A stand-in robot publishes scans and odometry at fixed rates, and follows `cmd_vel`.
 """
 
 import os
@@ -53,7 +53,7 @@ GOAL = [1e4, 0.0]  # never reached [m]
 
 @dataclass(frozen=True)
 class Latency:
-    """How long after the stamp of a scan a command came [ms]; NaN if none did."""
+    """Time from the stamp of a scan to a command [ms]; NaN if none came."""
 
     median_ms: float
     p99_ms: float
@@ -61,13 +61,13 @@ class Latency:
 
 @dataclass(frozen=True)
 class Load:
-    """What was measured with one share of a core, at one rate."""
+    """Measurement with one share of a core, at one rate."""
 
     cores: float  # share of one core that the three nodes had
     rate: float  # of scans and of odometry [Hz]
     scans: int
     answered: float  # fraction of the scans with a `cmd_vel_raw`
-    cpu: dict[str, float]  # fraction of a core that each node took
+    cpu: dict[str, float]  # fraction of a core that each node used
     # of each node and its children, shared pages in part (PSS)
     memory_mb: dict[str, float]
     policy: Latency  # until `cmd_vel_raw`
@@ -76,7 +76,7 @@ class Load:
 
 @dataclass(frozen=True)
 class Record:
-    """What the stand-in robot sent and heard; times [ns] on the system clock."""
+    """What the stand-in robot sent and received; times [ns] on the system clock."""
 
     scans: list[int] = field(default_factory=list)
     answers: dict[int, int] = field(default_factory=dict)  # by the stamp of the scan
@@ -84,7 +84,7 @@ class Record:
 
 
 class StandIn(Listener):
-    """A robot in a round room that moves with it; it does what `cmd_vel` says."""
+    """A robot in a round room that moves with it; it follows `cmd_vel`."""
 
     def __init__(self, model: SimulatorModel, domain_id: int) -> None:
         super().__init__("stand_in", domain_id, NAMESPACE)
@@ -170,8 +170,8 @@ def measure_load(
 ) -> tuple[list[Load], str]:
     """Run the nodes on one core, with shares of it, and measure them for a time [s] at each rate.
 
-    Returns what was measured, and why there are no shares, or "". Raises BackendError if a node
-    ends, or the gate does not arm.
+    Returns the measurements, and why the shares could not be limited, or "". Raises BackendError if
+    a node ends or the gate does not arm.
     """
     if sys.platform != "linux":
         raise BackendError("the load of the nodes can only be measured on Linux.")
@@ -188,7 +188,7 @@ def measure_load(
         plan = list(product(cores, rates))
         for share, rate in plan:
             tell(f"{share:g} of a core, {rate:g} Hz", len(loads), len(plan))
-            robot.set_rate(model.lidar.rate)  # at another one, the gate does not arm
+            robot.set_rate(model.lidar.rate)  # at another rate, the gate does not arm
             if group is not None:
                 group.limit(1.0)
             robot.arm()
@@ -299,7 +299,7 @@ def _measure(
 
 
 def _measure_cpu(nodes: Sequence[NodeProcess], seconds: float) -> dict[str, float]:
-    """Return what fraction of a core each node takes within a time [s]."""
+    """Return the fraction of a core that each node uses during a time [s]."""
     began_s = time.monotonic()
     before_s = {node.node: read_cpu_time(node.pid) for node in nodes}
     time.sleep(seconds)

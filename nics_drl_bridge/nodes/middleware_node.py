@@ -99,7 +99,7 @@ class MiddlewareNode(ManagedNode):
             missing = "nobody publishes one, though the model was made with it: the wheels turn"
             self.get_logger().warning(f"imu: {missing}", once=True)
         else:
-            awaited = tuple(dict.fromkeys((*awaited, *self._topics.hoped_for)))
+            awaited = tuple(dict.fromkeys((*awaited, *self._topics.optional)))
         level, trouble = judge_topics(health, awaited, self._rejected)
         self._rejected = health.rejected
         message = trouble or ("receiving" if self.state == ACTIVE else self.state)

@@ -187,7 +187,7 @@ class Operator(AbstractContextManager["Operator", None]):
         if not holds(topic.get_subscription_count, left_s, POLL_S):
             condition = self._policies[name][0]
             raise BackendError(
-                f"{name} hears no goals, its state is {condition!r}; see its log."
+                f"{name} does not listen to goals; its state is {condition!r}; see its log."
             )
         send = partial(self._send, topic, goal, name, deadline)
         return ask_until_granted(send, deadline, tell, f"{name} does not take the goal")

@@ -229,7 +229,7 @@ class PolicyNode(ManagedNode):
         verdict = self._task.judge(self._topics.view(), {"goal": self._goal})
         if verdict.reached or verdict.touched:
             if verdict.touched:
-                why = "touching something, stopped"
+                why = "the robot touches something and is stopped"
             else:
                 now = self._topics.middleware.estimator.covariance[:3, :3]
                 gained = compute_uncertainty_gain(self._covariance, now)

@@ -131,7 +131,7 @@ class RobotTopics:
     @property
     def lacks_gyro(self) -> bool:
         """True if the model was made with a gyro, and nobody publishes one."""
-        if not self.hoped_for:
+        if not self.optional:
             return False
         return not any(self._node.count_publishers(topic) for topic in IMU_NAMES)
 
@@ -143,9 +143,9 @@ class RobotTopics:
         self._gyro = GyroReader()
         for topic in topics:
             self._subscribe(topic, Imu, partial(self._take_imu, topic), qos.SENSOR)
-        self.hoped_for: tuple[str, ...] = ()
+        self.optional: tuple[str, ...] = ()  # used if they arrive
         if wanted == defaults.IMU_TOPIC and topics:
-            self.hoped_for = (measurement.IMU,)
+            self.optional = (measurement.IMU,)
         elif topics:
             self.expected = (*self.expected, measurement.IMU)
             self.expected_topics = (*self.expected_topics, wanted)

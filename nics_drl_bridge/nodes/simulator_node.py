@@ -14,7 +14,6 @@ from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, LaserScan
@@ -44,18 +43,16 @@ from nics_drl_bridge.nodes.parts import open_parts
 from nics_drl_bridge.nodes.runner import OK, WARN
 from nics_drl_bridge.nodes.world_topics import WorldTopics
 from nics_drl_bridge.pacing import RealTime, TopicPace
-from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
-# longest time between two messages in real time [ns]
 CLOCK = "/clock"
-CLOCK_NS = 15_000_000
-WATCH_S = 2.0
-QUIET_S = 5.0
-LAGGING_S = 5.0  # diagnostics warn for so long after it fell behind real time
-PART = "simulator"  # how the name of its status ends
+CLOCK_NS = 15_000_000  # longest time between two ticks of it in real time
+WATCH_S = 2.0  # between two checks for other publishers of /clock
+QUIET_S = 5.0  # between two equal warnings
+LAGGING_S = 5.0  # diagnostics warn for this long after it fell behind real time
+PART = "simulator"  # end of its name in diagnostics
 # longest time between two checks for delayed data that are due [s]
 LONGEST_TICK_S = 0.005
 
@@ -114,25 +111,23 @@ class RobotPort:
 
     def __init__(
         self,
-        node: Node,
-        namespace: str,
-        model: SimulatorModel,
-        frames: device_parameters.Frames,
-        time: device_parameters.DeviceTiming,
-        outbox: Outbox,
+        node: "DeviceNode",
+        name: str,
+        take: Callable[["RobotPort", Array], None],
     ) -> None:
         self._node = node
-        self._model = model
-        self.name = namespace.strip("/") or model.robot.name
-        self.frames = frames
-        self._outbox = outbox
+        self._model = model = node.model
+        self.name = name.strip("/") or model.robot.name
+        self.frames = frames = device_parameters.get_frames(node, name.strip("/"))
+        self.namespace = namespace = f"{name}/" if name else ""
         self._publishers: list[Publisher] = []
-        self.inlet: CommandInlet  # of the robot's commands
+        self.inlet = CommandInlet(node, namespace, partial(take, self))
         self.command_ns = 0  # time of the newest command
         self.has_command = False  # in lock-step: since the last step
         self._joint_writer = conversions.JointWriter(model.robot)
-        self._send = partial(outbox.send, late=time.odom_late_ns)
-        self._send_scan = partial(outbox.send, late=time.scan_late_ns)
+        timing = node.timing
+        self._send = partial(node.outbox.send, late=timing.odom_late_ns)
+        self._send_scan = partial(node.outbox.send, late=timing.scan_late_ns)
 
         def publisher(kind: Any, topic: str) -> Publisher:
             made = node.create_publisher(
@@ -155,10 +150,10 @@ class RobotPort:
         ]
         free = np.full(model.lidar.beams, np.inf, np.float32)
         scan = conversions.scan_to_ros(model.lidar, free, 0, frames.laser)
-        scan.scan_time = time.scan_ns / NS_PER_S
+        scan.scan_time = timing.scan_ns / NS_PER_S
         # A device that turns counter-clockwise measures beam 0 first.
         sweep_s = max(0.0, scan.time_increment) * (model.lidar.beams - 1)
-        self._sweep_ns = 0 if time.lockstep else round(sweep_s * NS_PER_S)
+        self._sweep_ns = 0 if timing.lockstep else round(sweep_s * NS_PER_S)
         self._scan = wire.ScanWriter(scan)
         linear, _, turn = variances(model.noise.odometry)
         odom = (LEAST_VARIANCE, LEAST_VARIANCE, linear, turn)
@@ -171,7 +166,7 @@ class RobotPort:
     def close(self) -> None:
         """End its topics."""
         self.inlet.close()
-        self._outbox.drop(self._publishers)
+        self._node.outbox.drop(self._publishers)
         for publisher in self._publishers:
             self._node.destroy_publisher(publisher)
 
@@ -223,17 +218,14 @@ class CommandInlet:
 
     def __init__(
         self,
-        node: Node,
+        node: "DeviceNode",
         namespace: str,
-        robot: RobotSpec,
-        quality: QoSProfile,
         take: Callable[[Array], None],
-        too_old: Callable[[int], bool],
     ) -> None:
         self._node = node
-        self._robot = robot
+        self._robot = robot = node.model.robot
         self._take = take
-        self._too_old = too_old
+        quality = qos.EVERY_COMMAND if node.timing.lockstep else qos.COMMAND
         stamped = runner.get_flag(node, "enable_stamped_cmd_vel")
         self._hear = partial(self._on_bytes, stamped)
         kind = name_of(stamped)
@@ -293,7 +285,7 @@ class CommandInlet:
             self._obey((message.drive.speed, 0.0, angle), self._robot.from_fields)
 
     def _is_fresh(self, stamp_ns: int) -> bool:
-        if not stamp_ns or not self._too_old(stamp_ns):
+        if not stamp_ns or not self._node.is_too_old(stamp_ns):
             return True
         why = "its stamp is older than command_timeout; do both ends use one clock (use_sim_time)?"
         self._complain(f"a command is ignored, because {why}")
@@ -318,10 +310,10 @@ class DeviceNode(qos.BridgeNode):
         super().__init__(name, **options)
         model = runner.declare_model(self)
         device_parameters.declare_device(self, model.lidar.frame)
-        self._time = device_parameters.get_timing(self, model)
+        self.timing = device_parameters.get_timing(self, model)
         self._names = parameters.name_fleet(self.get_parameter("robots").value)
         self._given = model
-        self.model = device_parameters.apply_timing(self, model, self._time)
+        self.model = device_parameters.apply_timing(self, model, self.timing)
         self._make = make
         self.use_world(load_worlds(runner.get_text(self, "world")))
         self.paused = False
@@ -330,7 +322,7 @@ class DeviceNode(qos.BridgeNode):
         self._hardware = model.robot.name
         self._told_ns = 0  # newest time on `/clock`
         self.device.advance()  # compiles before any peer waits
-        self._first_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
+        self._first_ns = time.time_ns() // self.timing.step_ns * self.timing.step_ns
         self.now_ns = self._first_ns
         self._open_topics()
         self._start_time()
@@ -367,11 +359,11 @@ class DeviceNode(qos.BridgeNode):
         return [port.frames for port in self._ports]
 
     def _open_topics(self) -> None:
-        self._outbox = Outbox()
+        self.outbox = Outbox()
         self._clock_topic = self.create_publisher(Clock, CLOCK, qos.SENSOR_RELIABLE)
         self._clocks = {self.get_fully_qualified_name()}
         self._ports: list[RobotPort] = []
-        self._world_topics = WorldTopics(self, lambda: self.device)
+        self._world_topics = WorldTopics(self)
         for name in self._names:
             self._open_robot(name)
         self._open_transforms()
@@ -383,19 +375,9 @@ class DeviceNode(qos.BridgeNode):
         runner.diagnose(self, PART, self._look)
 
     def _open_robot(self, name: str) -> None:
-        space = f"{name}/" if name else ""
-        frames = device_parameters.get_frames(self, name.strip("/"))
-        port = RobotPort(self, space, self.model, frames, self._time, self._outbox)
-        port.inlet = CommandInlet(
-            self,
-            space,
-            self.model.robot,
-            qos.EVERY_COMMAND if self._time.lockstep else qos.COMMAND,
-            partial(self._on_command, port),
-            self._too_old,
-        )
+        port = RobotPort(self, name, self._on_command)
         port.inlet.heard.append(
-            self._world_topics.hear(space, lambda: self._ports.index(port))
+            self._world_topics.hear(port.namespace, lambda: self._ports.index(port))
         )
         self._ports.append(port)
 
@@ -441,22 +423,22 @@ class DeviceNode(qos.BridgeNode):
     def _start_time(self) -> None:
         # On the steady clock: with use_sim_time the node's clock would wait for this very node.
         runner.call_periodically(self, WATCH_S, self._watch)
-        step_ns = self._time.step_ns
-        self._odom_pace = TopicPace(self._time.odom_ns, step_ns)
-        self._scan_pace = TopicPace(self._time.scan_ns, step_ns)
-        self._real_time = RealTime(step_ns, self._time.rate)
+        step_ns = self.timing.step_ns
+        self._odom_pace = TopicPace(self.timing.odom_ns, step_ns)
+        self._scan_pace = TopicPace(self.timing.scan_ns, step_ns)
+        self._real_time = RealTime(step_ns, self.timing.rate)
         self._timer = None
         self._soon = self.create_guard_condition(self._on_time)
         self._complete = self.create_guard_condition(self._advance_if_complete)
-        if self._time.mode == parameters.REALTIME:
-            period = step_ns / NS_PER_S / self._time.rate
+        if self.timing.mode == parameters.REALTIME:
+            period = step_ns / NS_PER_S / self.timing.rate
             # If data are published later than measured, use a tick that divides the step.
-            late = any((*self._time.scan_late_ns, *self._time.odom_late_ns))
+            late = any((*self.timing.scan_late_ns, *self.timing.odom_late_ns))
             ticks = max(1.0, np.ceil(period / LONGEST_TICK_S)) if late else 1.0
             self._timer = runner.call_periodically(self, period / ticks, self._on_time)
             if period * NS_PER_S > CLOCK_NS:
                 runner.call_periodically(self, CLOCK_NS / NS_PER_S, self._on_clock)
-        elif not self._time.lockstep:
+        elif not self.timing.lockstep:
             runner.call_periodically(
                 self, 0.0, lambda: None if self.paused else self.step()
             )
@@ -472,8 +454,8 @@ class DeviceNode(qos.BridgeNode):
 
     def _look(self) -> runner.Condition:
         facts = {
-            "mode": self._time.mode,
-            "rate": self._time.rate,
+            "mode": self.timing.mode,
+            "rate": self.timing.rate,
             "robots": len(self._names),
             "simulated time [s]": f"{self.now_ns / NS_PER_S:.3f}",
             "times it fell behind real time": self._lags,
@@ -492,7 +474,7 @@ class DeviceNode(qos.BridgeNode):
     def _test(
         self, _: SelfTest.Request, response: SelfTest.Response
     ) -> SelfTest.Response:
-        """Answer what is simulated since when; it passes unless a robot touched something."""
+        """Report what is simulated and since when; passes unless a robot touched something."""
         response.id = self._hardware
         response.passed = bytes([not any(self.device.touched)])
         response.status = [runner.status_to_ros(self, PART, self._look())]
@@ -503,10 +485,10 @@ class DeviceNode(qos.BridgeNode):
         names = [port.name for port, has_touched in touched if has_touched]
         return True, f"touched something: {', '.join(names) or 'nobody'}"
 
-    def _too_old(self, stamp_ns: int) -> bool:
-        """Return whether a command of a time is over; in lock-step it never is."""
+    def is_too_old(self, stamp_ns: int) -> bool:
+        """Return whether a command of a time [ns] has timed out; in lock-step none does."""
         timeout_ns = int(runner.get_number(self, "command_timeout") * NS_PER_S)
-        return not self._time.lockstep and self.now_ns - stamp_ns > timeout_ns
+        return not self.timing.lockstep and self.now_ns - stamp_ns > timeout_ns
 
     def _on_command(self, port: RobotPort, command: Array) -> None:
         if port not in self._ports:  # its robot has left since the command arrived
@@ -514,14 +496,14 @@ class DeviceNode(qos.BridgeNode):
         robot = self._ports.index(port)
         self.device.commands[robot] = command
         port.command_ns = self.now_ns
-        if self._time.lockstep and not self.paused:
+        if self.timing.lockstep and not self.paused:
             port.has_command = True
             self._advance_if_complete()
 
     def _advance_if_complete(self) -> None:
         """In lock-step, move the world once all present robots have a command."""
         complete = all(port.has_command for port in self._ports)
-        if self._time.lockstep and not self.paused and complete and self._ports:
+        if self.timing.lockstep and not self.paused and complete and self._ports:
             self.advance()
 
     def _on_time(self) -> None:
@@ -534,20 +516,20 @@ class DeviceNode(qos.BridgeNode):
             fix = "choose a lower rate, scan_rate or odom_rate, or fewer robots"
             warning = f"this machine does not keep up with real time; {fix}"
             self.get_logger().warning(warning, throttle_duration_sec=5.0)
-            self._real_time.begin(steady_ns, self.now_ns + self._time.step_ns)
+            self._real_time.begin(steady_ns, self.now_ns + self.timing.step_ns)
         behind = self._real_time.behind(steady_ns, self.now_ns)
         if behind:
             self.advance()
         if behind > 1:
             self._soon.trigger()  # not here: commands that have arrived are for the next step
-        self._outbox.flush(max(self.now_ns, self._real_time.time_at(steady_ns)))
+        self.outbox.flush(max(self.now_ns, self._real_time.time_at(steady_ns)))
 
     def _on_clock(self) -> None:
         """Publish the time between two steps, which may be too far apart for timers on `/clock`."""
         if self.paused:
             return
         time_ns = self._real_time.time_at(time.monotonic_ns())
-        between_ns = min(time_ns, self.now_ns + self._time.step_ns - 1)
+        between_ns = min(time_ns, self.now_ns + self.timing.step_ns - 1)
         if self._told_ns < between_ns:
             self._tell_time(between_ns)
 
@@ -560,10 +542,10 @@ class DeviceNode(qos.BridgeNode):
         """Move the world by one step, and publish what is due."""
         for k, port in enumerate(self._ports):
             port.has_command = False
-            if self._too_old(port.command_ns):
+            if self.is_too_old(port.command_ns):
                 self.device.commands[k] = 0.0
         self.device.advance()
-        self.now_ns += self._time.step_ns
+        self.now_ns += self.timing.step_ns
         self._publish()
 
     def begin(self, rewind: bool = False) -> None:
@@ -575,7 +557,7 @@ class DeviceNode(qos.BridgeNode):
             self.now_ns = self._first_ns
         for port in self._ports:
             port.has_command = False
-        self.now_ns += self._time.step_ns
+        self.now_ns += self.timing.step_ns
         self._episode_ns = self.now_ns
         self._publish_after_jump()
 
@@ -588,7 +570,7 @@ class DeviceNode(qos.BridgeNode):
 
     def _publish_after_jump(self) -> None:
         """Publish all topics after the time or the world has jumped."""
-        self._outbox.clear()
+        self.outbox.clear()
         self._odom_pace.begin(self.now_ns)
         self._scan_pace.begin(self.now_ns)
         self._go_on()
@@ -597,7 +579,7 @@ class DeviceNode(qos.BridgeNode):
     def step(self) -> None:
         """Move the world by one step, even while paused, and publish what is due."""
         self.advance()
-        self._outbox.flush(self.now_ns)
+        self.outbox.flush(self.now_ns)
 
     def pause(self, paused: bool) -> None:
         """Pause or resume time."""
@@ -630,7 +612,7 @@ class DeviceNode(qos.BridgeNode):
         return response
 
     def _repeat(self) -> tuple[bool, str]:
-        if not self._time.lockstep:
+        if not self.timing.lockstep:
             return False, "data are only repeated in lock-step"
         self._publish_data(odom_due=True, scan_due=True)
         return True, ""
@@ -656,7 +638,7 @@ class DeviceNode(qos.BridgeNode):
                 port.publish_scan(sensed, now_ns)
         if moving:  # with the delay of the odometry behind it
             message = self._transforms(transforms=moving)
-            self._outbox.send(self._moving, message, now_ns, self._time.odom_late_ns)
+            self.outbox.send(self._moving, message, now_ns, self.timing.odom_late_ns)
 
 
 def declare_renderer(node: Node, default: Renderer) -> Renderer:

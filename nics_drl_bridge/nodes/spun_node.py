@@ -24,11 +24,11 @@ class SpunNode:
         self._clients: dict[str, Any] = {}
 
     def spin(self, timeout_s: float = 0.01) -> None:
-        """Handle one event, if one comes in time."""
+        """Handle one event, if one arrives in time."""
         self._executor.spin_once(timeout_sec=timeout_s)
 
     def until(self, done: Callable[[], object], seconds: float) -> bool:
-        """Spin until something is the case; return False if it does not come to be in time."""
+        """Spin until a condition holds; return False if it does not in time."""
         end = time.monotonic() + seconds
         while not done():
             if time.monotonic() > end:
@@ -46,11 +46,11 @@ class SpunNode:
         ready = self.until(client.service_is_ready, patience_s)
         future = client.call_async(kind.Request() if request is None else request)
         if not (ready and self.until(future.done, patience_s)):
-            raise TimeoutError(f"not within {patience_s:g} s: {name}")
+            raise TimeoutError(f"service {name}: no answer within {patience_s:g} s")
         return future.result()
 
     def close(self) -> None:
-        """Leave the graph."""
+        """End the node."""
         self._executor.shutdown(timeout_sec=1.0)
         self.node.destroy_node()
         self._context.try_shutdown()

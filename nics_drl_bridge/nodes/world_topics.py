@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -11,8 +11,10 @@ from nav_msgs.msg import OccupancyGrid
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.conversions import INITIAL_POSE, read_initial_pose
-from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.occupancy import occupancy, standing
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.nodes.simulator_node import DeviceNode
 
 LOOK_S = 0.2  # time between two checks of what stands in the world [s]
 
@@ -24,9 +26,8 @@ class WorldTopics:
     computed before anyone subscribes.
     """
 
-    def __init__(self, node: Any, world: Callable[[], DeviceWorld]) -> None:
+    def __init__(self, node: "DeviceNode") -> None:
         self._node = node
-        self._world = world
         self._frame = runner.get_text(node, "map_frame")
         self._cell = runner.get_number(node, "map_resolution")
         self._map = node.create_publisher(OccupancyGrid, "map", qos.LATCHED)
@@ -44,7 +45,7 @@ class WorldTopics:
     def _look(self) -> None:
         if self._shown is None and not self._map.get_subscription_count():
             return
-        world = self._world()
+        world = self._node.device
         simulator = world.simulator
         member = int(simulator.data.member[0])
         still = standing(simulator.sampler, member, simulator.obstacles[0])
@@ -64,7 +65,7 @@ class WorldTopics:
         self, robot: Callable[[], int], message: PoseWithCovarianceStamped
     ) -> None:
         logger = self._node.get_logger()
-        simulator = self._world().simulator
+        simulator = self._node.device.simulator
         try:
             pose = read_initial_pose(message, self._frame)
             x1, y1, x2, y2 = simulator.world.members[
@@ -80,7 +81,7 @@ class WorldTopics:
             logger.error(f"{error} The robot stays where it is.")
             return
         simulator.put_robot(robot(), pose, np.zeros(simulator.data.state.shape[-1]))
-        self._world().put(robot())
+        self._node.device.put(robot())
         logger.info(
-            f"a robot is put at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad"
+            f"the robot was put at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad"
         )

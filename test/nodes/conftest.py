@@ -14,12 +14,12 @@ LOG_CHARACTERS = 2000
 # Nodes are started with `cmd_vel` as a Twist, whatever the distribution, unless a test asks for
 # the other type or for the default: `test_stamped_commands.py` is about these.
 LAUNCHED: list[Any] = []
-"""The processes of the test that runs, and of the others of its module."""
+"""The nodes of the running test, and of the others of its module."""
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport() -> Iterator[None]:
-    """Where a test fails, what the nodes around it said is told, too."""
+    """If a test fails, report what its nodes have logged, too."""
     report = yield
     if report.failed:
         for each in LAUNCHED:
@@ -37,7 +37,7 @@ def pytest_runtest_makereport() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def model() -> SimulatorModel:
-    """A car; driven once, so that the nodes of the tests find everything compiled."""
+    """A car, driven once so that everything is compiled."""
     built = builtin_model("ackermann")
     env = BridgeEnv(model=built)
     env.reset(seed=0)
@@ -56,7 +56,7 @@ def model_folder(
 
 @pytest.fixture(scope="module")
 def domains() -> Iterator[ExitStack]:
-    """The domains of a module, which stay its own as long as anybody of it may live in them."""
+    """The domains of a module, which stay claimed until its end."""
     with ExitStack() as claimed:
         yield claimed
 
@@ -92,6 +92,43 @@ def make_node(domain_id: int) -> Iterator[Callable[..., Any]]:
             return node
 
         yield make
+
+
+@pytest.fixture
+def direct(
+    make_node: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Any]:
+    """Makes nodes that do not spin and whose messages are kept, `direct("rate:=2.0", kind=...)`."""
+    from nics_drl_bridge.nodes.qos import BridgeNode
+    from nics_drl_bridge.nodes.runner import ManagedNode
+    from nodes.direct import Direct, Kept
+
+    def keep(node: Any, kind: Any, topic: str, *_: Any, **__: Any) -> Kept:
+        return Kept(node, kind, topic)
+
+    monkeypatch.setattr(BridgeNode, "create_publisher", keep)
+    monkeypatch.setattr(ManagedNode, "create_lifecycle_publisher", keep)
+
+    def make(*parameters: str, **options: Any) -> Direct:
+        node = make_node(*parameters, **options)
+        if isinstance(node, ManagedNode):
+            node.start()
+        return Direct(node)
+
+    return make
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The time of the nodes that `direct` makes, which stands still by itself."""
+    from nics_drl_bridge.nodes import command_gate, record_node, simulator_node
+    from nodes.direct import Clock
+
+    clock = Clock()
+    clock.now_s = 1000.0
+    for module in (command_gate, record_node, simulator_node):
+        monkeypatch.setattr(module, "time", clock)
+    return clock
 
 
 def starter(
@@ -133,7 +170,7 @@ def launch(
 def launch_process(
     domains: ExitStack, model_folder: str, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Callable[..., Any]]:
-    """The same in processes, for what only a process can show."""
+    """The same in processes, for promises of processes."""
     from nics_drl_bridge.nodes.processes import NodeProcess
 
     yield from starter(NodeProcess, model_folder, tmp_path_factory)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import signal
-import sys
 import threading
-import time
+from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from rclpy.impl.rcutils_logger import RcutilsLogger
+from rclpy.impl import rcutils_logger
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.nodes import runner
@@ -25,6 +23,22 @@ MODULES = {
     "dart_node": "nics_drl_bridge.extras.dart.node",
     "mujoco_node": "nics_drl_bridge.extras.mujoco.node",
 }
+LINES: defaultdict[str, list[str]] = defaultdict(list)
+"""What has been logged in each thread, by its name."""
+log_in_rclpy = rcutils_logger.RcutilsLogger.log
+
+
+def keep_line(logger: Any, message: str, *given: Any, **options: Any) -> bool:
+    """Log as rclpy does, and keep the line unless it is throttled."""
+    is_logged = log_in_rclpy(logger, message, *given, **options)
+    if is_logged:
+        LINES[threading.current_thread().name].append(str(message))
+    return is_logged
+
+
+rcutils_logger.RcutilsLogger.log = keep_line
+# rclpy throttles by the caller, which it looks for outside of these files
+rcutils_logger._internal_callers.append(__file__)
 
 
 class NodeThread(AbstractContextManager["NodeThread", None]):
@@ -45,27 +59,24 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
             dump_yaml({"/**": {"ros__parameters": parameters}}), encoding="utf-8"
         )
         arguments = [node, "--ros-args", "--params-file", str(file)]
-        if namespace:
-            arguments += ["-r", f"__ns:=/{namespace.strip('/')}"]
-        for old, new in (remap or {}).items():
+        rules = {"__ns": f"/{namespace.strip('/')}"} if namespace else {}
+        for old, new in (rules | (remap or {})).items():
             arguments += ["-r", f"{old}:={new}"]
         self.node = node
-        self.lines: list[str] = []
+        self.lines = LINES[str(folder)]
         self.returncode: int | None = None
         self.stopping = threading.Event()
         self.log = self._process = self  # what tests ask of a process and of its log
+        given = [*arguments, *words], domain_id
         self._thread = threading.Thread(
-            target=self._run,
-            args=([*arguments, *words], domain_id),
-            daemon=True,
-            name=node,
+            target=self._run, args=given, daemon=True, name=str(folder)
         )
         self._thread.start()
 
     def _run(self, arguments: list[str], domain_id: int) -> None:
         try:
             made = runner.run_until_end(
-                partial(make_logged, self.node, self.lines),
+                node_class(self.node),
                 open_context(arguments, domain_id),
                 self.stopping,
                 self.node,
@@ -84,7 +95,7 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
             raise
 
     def read_text(self, **_: Any) -> str:
-        """What it has logged, and written to standard error."""
+        """Return what it has logged, and written to standard error."""
         return "".join(f"{line}\n" for line in self.lines)
 
     def poll(self) -> int | None:
@@ -101,9 +112,8 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
         self.stopping.set()
 
     def check(self) -> None:
-        assert self._thread.is_alive(), (
-            f"{self.node} ended with {self.returncode}: {self.lines}"
-        )
+        told = f"{self.node} ended with {self.returncode}: {self.lines}"
+        assert self._thread.is_alive(), told
 
     def close(self) -> int | None:
         self.stopping.set()
@@ -114,52 +124,8 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
 
 
 def node_class(node: str) -> Any:
-    """What makes the node of an executable, by rclpy's keyword arguments."""
+    """Return what makes the node of an executable, by rclpy's keyword arguments."""
     if node == "record_node":
         return RecordNode
     module = import_module(MODULES.get(node, f"nics_drl_bridge.nodes.{node}"))
     return module.main.args[0]
-
-
-def make_logged(node: str, lines: list[str], **options: Any) -> Any:
-    """A node that also keeps what it logs."""
-    made = node_class(node)
-    kind, *arguments = (made.func, *made.args) if isinstance(made, partial) else (made,)
-
-    said: dict[tuple[str, int], float] = {}
-
-    class Logged(kind):
-        def get_logger(self) -> Keeper:
-            return Keeper(super().get_logger().name, lines, said)
-
-    return Logged(*arguments, **options)
-
-
-class Keeper(RcutilsLogger):
-    """A logger that also keeps its lines.
-
-    rclpy throttles, and checks the severity, by the caller of `log`, which is always this class. So
-    this class throttles itself, and leaves each line to a new logger.
-    """
-
-    def __init__(
-        self, name: str, lines: list[str], said: dict[tuple[str, int], float]
-    ) -> None:
-        super().__init__(name)
-        self._lines = lines
-        self._said = said
-
-    def log(
-        self,
-        message: str,
-        severity: Any,
-        throttle_duration_sec: float = 0.0,
-        **options: Any,
-    ) -> bool:
-        caller = sys._getframe(2)
-        place = (caller.f_code.co_filename, caller.f_lineno)
-        if time.monotonic() < self._said.get(place, -1e9) + throttle_duration_sec:
-            return False
-        self._said[place] = time.monotonic()
-        self._lines.append(str(message))
-        return RcutilsLogger(self.name).log(message, severity, **options)

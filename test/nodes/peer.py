@@ -3,17 +3,20 @@
 import itertools
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.srv import SelfTest
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike
-from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rcl_interfaces.srv import GetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import Parameter
+from sensor_msgs.msg import LaserScan
 
+from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.listener import open_context
 
@@ -24,7 +27,7 @@ NUMBERS = itertools.count()
 
 
 class Peer:
-    """Listens, speaks and calls; spins in place, only ever until something is the case."""
+    """Listens, publishes and calls services; spins in place while it waits for a condition."""
 
     def __init__(self, domain_id: int, namespace: str = "") -> None:
         self.context = open_context(domain_id=domain_id)
@@ -40,7 +43,7 @@ class Peer:
     def until(
         self, condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S
     ) -> float:
-        """Spins until a condition holds; returns how long that took [s]."""
+        """Spin until a condition holds; return how long that took [s]."""
         began = time.monotonic()
         while not condition():
             assert time.monotonic() - began < deadline_s, (
@@ -50,14 +53,14 @@ class Peer:
         return time.monotonic() - began
 
     def within(self, seconds: float, condition: Callable[[], Any]) -> bool:
-        """Spins until a condition holds, or the time is over; returns whether it holds."""
+        """Spin until a condition holds or the time is over; return whether it holds."""
         deadline = time.monotonic() + seconds
         while not condition() and time.monotonic() < deadline:
             self._executor.spin_once(timeout_sec=0.05)
         return bool(condition())
 
     def another(self, messages: list[Any], what: str) -> Any:
-        """The next message in a list that `listen` gave."""
+        """Return the next message in a list that `listen` returned."""
         known = len(messages)
         self.until(lambda: len(messages) > known, f"another {what}")
         return messages[-1]
@@ -65,7 +68,7 @@ class Peer:
     def listen(
         self, kind: Any, topic: str, quality: Any = qos.SENSOR_RELIABLE
     ) -> list[Any]:
-        """A list that each message of a topic is appended to."""
+        """Return a list to which each message of a topic is appended."""
         received: list[Any] = []
         self.node.create_subscription(kind, topic, received.append, quality)
         return received
@@ -73,7 +76,7 @@ class Peer:
     def speak(
         self, kind: Any, topic: str, subscribers: int = 1, quality: Any = qos.COMMAND
     ) -> Any:
-        """A publisher that the given number of subscribers have found."""
+        """Return a publisher once the given number of subscribers have found it."""
         publisher = self.node.create_publisher(kind, topic, quality)
         self.until(
             lambda: publisher.get_subscription_count() >= subscribers,
@@ -89,7 +92,7 @@ class Peer:
         times: int = 6,
         each_s: float = ANSWERED_S,
     ) -> Any:
-        """The answer of a service, which is asked again where none comes."""
+        """Return the answer of a service; ask again if none comes."""
         client = self.node.create_client(kind, service)
         self.until(client.service_is_ready, f"the service {service}")
         futures: list[Any] = []
@@ -110,27 +113,16 @@ class Peer:
         return answered()[0]
 
     def read_episode(self, simulator: str = "simulator_node") -> dict[str, str]:
-        """What a simulator tells of the present episode."""
+        """Return the facts of a simulator about the present episode."""
         (status,) = self.call(SelfTest, f"{simulator}/self_test").status
         return {pair.key: pair.value for pair in status.values}
 
     def be_known_to(self, node: str) -> None:
-        """Waits until a node knows all that listens here: its answer shows that it does.
+        """Wait until a node has discovered all subscriptions of this peer.
 
-        Listeners are announced in order, and the one of the answer is the last.
+        Subscriptions are announced in order, and that of the answer comes last.
         """
         self.call(GetParameters, f"{node}/get_parameters")
-
-    def set_parameters(self, node: str, **values: Any) -> Any:
-        """What a node says to new values of its parameters."""
-        request = SetParametersAtomically.Request()
-        request.parameters = [
-            Parameter(name, value=value).to_parameter_msg()
-            for name, value in values.items()
-        ]
-        return self.call(
-            SetParametersAtomically, f"{node}/set_parameters_atomically", request
-        ).result
 
     def close(self) -> None:
         self._executor.shutdown(timeout_sec=1.0)
@@ -143,13 +135,64 @@ def stamp_ns(message: Any) -> int:
 
 
 def pose_of(odometry: Odometry) -> np.ndarray:
-    """The pose (3,) of an odometry."""
+    """Return the pose (3,) of an odometry."""
     return conversions.odometry_from_ros(odometry)[0]
 
 
 def odometry(
     stamp: int, pose: ArrayLike = (0.0, 0.0, 0.0), twist: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Odometry:
-    """An odometry of a robot, at rest at its origin unless said otherwise."""
+    """Return the odometry of a robot, by default at rest at its origin."""
     frames = ("odom", "base_link")
     return conversions.odometry_to_ros(pose, twist, stamp, frames, (1e-4,) * 4)
+
+
+class PlayedRobot:
+    """Odometry, scans and poses of a robot that the test plays."""
+
+    def __init__(self, peer: Peer, lidar: LidarSpec) -> None:
+        self.peer = peer
+        self._lidar = lidar
+        publish = partial(peer.node.create_publisher, qos_profile=qos.SENSOR_RELIABLE)
+        self._odom = publish(Odometry, "odom")
+        self._scan = publish(LaserScan, "scan")
+        self._pose = publish(PoseStamped, "pose")
+        self._stamps = itertools.count(10**9, 10**8)
+
+    def send(
+        self,
+        pose: ArrayLike = (0.0, 0.0, 0.0),
+        twist: ArrayLike = (0.0, 0.0, 0.0),
+        stamp: int | None = None,
+        scans: bool = True,
+    ) -> int:
+        """Publish the data of a stamp [ns], by default 0.1 s after the last; return it."""
+        stamp = next(self._stamps) if stamp is None else stamp
+        self._odom.publish(odometry(stamp, pose, twist))
+        if scans:
+            ranges = np.full(self._lidar.beams, 2.0, np.float32)
+            scan = conversions.scan_to_ros(self._lidar, ranges, stamp, "laser")
+            self._scan.publish(scan)
+        self._pose.publish(conversions.pose_to_ros(pose, stamp, "map"))
+        return stamp
+
+
+def drive_alike(here, there, seeds=(3, 4), steps=8) -> None:
+    """Drive two envs by the same random commands; all that they tell must be bit-identical."""
+    told = []
+    for env in (here, there):
+        rng = np.random.default_rng(0)
+        told.append([])
+        for seed in seeds:
+            told[-1].append(env.reset(seed=seed))
+            for _ in range(steps):
+                action = rng.uniform(-1.0, 1.0, env.action_space.shape)
+                seen, reward, ended, _, info = env.step(action.astype(np.float32))
+                told[-1].append((seen, info | {"reward": reward, "ended": ended}))
+    for (seen, info), (seen_there, info_there) in zip(*told, strict=True):
+        assert np.array_equal(seen, seen_there)
+        for key in {"reward", "ended", "pose", "covariance", "start"} & info.keys():
+            assert np.array_equal(info[key], info_there[key]), key
+        if "true_pose" in info_there:  # a quaternion rounds the heading
+            assert np.abs(info["true_pose"] - info_there["true_pose"]).max() < 1e-12
+    assert np.array_equal(here.scene.bodies, there.scene.bodies)

@@ -1,6 +1,6 @@
 import gc
-import signal
 from contextlib import closing
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,25 +11,25 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import Twist
 from rclpy.task import Future
+from std_srvs.srv import SetBool
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.errors import BackendError, ConfigError, ModelError, StaleDataError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.backends import (
-    DdsBackend,
-    dds_backend,
-    stack_facts,
-)
-from nics_drl_bridge.sim.scenes import member_of
+from nics_drl_bridge.nodes.backends import DdsBackend, dds_backend, stack_facts
+from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.world import load_world
+from nodes.peer import drive_alike
 
 pytestmark = pytest.mark.ros
 
 TIMEOUT_S = 30.0
 SHORT_S = 2.0
 NAMESPACE = "fleet/car_1"
+PAUSE = "simulator_node/pause"
+TEAM = {"task": "cooperative_reaching", "task_options": {"robots": 2}}
 START = Start(seed=3, pose=np.array([0.5, -0.5, 1.0]))
 
 
@@ -48,7 +48,7 @@ def simulator(launch, module_domain_id):
 
 @pytest.fixture
 def connect(simulator, model, arena):
-    """Makes backends on that simulator; all are closed with the test."""
+    """Make backends on that simulator; all are closed with the test."""
     made = []
 
     def make(**options):
@@ -65,42 +65,11 @@ def connect(simulator, model, arena):
         backend.close()
 
 
-@pytest.fixture
-def own_simulator(launch_process, domain_id, model, arena):
-    """A backend on a simulator that the test may harm, in a namespace."""
-    process = launch_process(
-        "simulator_node", domain_id, namespace=NAMESPACE, mode="lockstep"
-    )
-    backend = DdsBackend(
-        model, arena, namespace=NAMESPACE, domain_id=domain_id, timeout_s=TIMEOUT_S
-    )
-    yield backend, process, domain_id
-    backend.close()
-    process.close()
-
-
 @pytest.fixture(scope="module")
 def commands_heard(simulator, meet):
     """Speed of each command that reaches somebody else than the simulator."""
     peer = meet(simulator[0])
     return peer, peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND)
-
-
-def episodes(env, seeds, steps, rng):
-    """All that an env tells, under random commands, over several episodes."""
-    told = []
-    for seed in seeds:
-        observation, info = env.reset(seed=seed)
-        told.append(
-            (observation, 0.0, False, info["pose"], np.zeros((3, 3)), info["start"])
-        )
-        for _ in range(steps):
-            observation, reward, ended, _, info = env.step(
-                rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
-            )
-            known = info["pose"], info["covariance"], info["true_pose"]
-            told.append((observation, reward, ended, *known))
-    return [np.array(column, dtype=np.float64) for column in zip(*told, strict=True)]
 
 
 def drive(backend, speed=0.5, steps=3):
@@ -110,7 +79,7 @@ def drive(backend, speed=0.5, steps=3):
 
 
 def zero_follows(commands_heard, step, act):
-    """Waits until the last command that is heard after an act is zero."""
+    """Wait until the last command after an act is zero."""
     peer, heard = commands_heard
     heard.clear()
     peer.until(
@@ -121,7 +90,7 @@ def zero_follows(commands_heard, step, act):
 
 
 def complaint(backend):
-    """What a backend says about others on its topic; the name of a node may come late."""
+    """Return what a backend says about other publishers, whose names may come late."""
     try:
         backend._link.check_alone()
     except BackendError as error:
@@ -129,72 +98,27 @@ def complaint(backend):
     return ""
 
 
-def compare(here, there, seeds, steps):
-    """Drives two envs alike: all that they tell must be the same to the bit."""
-    with closing(there):
-        told = [
-            episodes(env, seeds, steps, np.random.default_rng(0))
-            for env in (here, there)
-        ]
-    *seen, truth = (np.abs(a - b).max() for a, b in zip(*told, strict=True))
-    # observation, reward, end, estimate and covariance; a quaternion rounds the true heading
-    assert seen == [0.0] * 5
-    assert truth < 1e-12
-
-
-def test_it_gives_the_numbers_of_the_simulator_in_process(simulator, model, arena):
-    options = {"domain_id": simulator[0], "truth": True, "timeout_s": TIMEOUT_S}
-    here = BridgeEnv("sim", model, arena, estimator=True)
-    there = BridgeEnv("dds", model, arena, backend_options=options)
-    compare(here, there, (7, 7, 2**31 - 1), 20)
-
-
-def test_episodes_in_a_set_of_worlds_with_maps_and_moving_obstacles_are_the_same(
-    launch, domain_id, model, tmp_path
+@pytest.mark.parametrize(
+    ("simulated", "arguments", "options"),
+    [
+        ({}, {}, {"truth": True}),
+        ({"world": "mixed.yaml"}, {"world": "mixed.yaml"}, {"truth": True}),
+        ({"robots": ["a", "b"]}, TEAM, {"namespaces": ["a", "b"]}),
+        ({"randomisation": "strong"}, {"randomisation": "strong"}, {}),
+    ],
+    ids=["one robot", "maps and moving obstacles", "a team", "randomised"],
+)
+def test_an_env_over_dds_tells_what_one_in_process_does_bit_for_bit(
+    launch, domain_id, model, tmp_path, monkeypatch, simulated, arguments, options
 ):
-    world = tmp_path / "mixed.yaml"
-    world.write_text("name: mixed\nworlds: [crowd, room, corridor]\n")
-    launch("simulator_node", domain_id, mode="lockstep", world=str(world))
-    options = {"domain_id": domain_id, "truth": True, "timeout_s": TIMEOUT_S}
-    here = BridgeEnv("sim", model, str(world), estimator=True)
-    there = BridgeEnv("dds", model, str(world), backend_options=options)
-    assert {member_of(here.world, seed) for seed in range(4)} == {0, 1, 2}
-    compare(here, there, range(4), 8)
-    assert np.array_equal(here.scene.bodies, there.scene.bodies)
-
-
-def test_a_team_over_dds_sees_what_a_team_in_process_sees(launch, model, domain_id):
-    launch("simulator_node", domain_id, mode="lockstep", robots=["a", "b"])
-    options = {"domain_id": domain_id, "namespaces": ["a", "b"]}
-    team = {"task": "cooperative_reaching", "task_options": {"robots": 2}}
-    here = BridgeEnv(model=model, estimator=True, **team)
-    there = BridgeEnv(model=model, backend="dds", backend_options=options, **team)
+    (tmp_path / "mixed.yaml").write_text("worlds: [crowd, room, corridor]\nname: mix\n")
+    monkeypatch.chdir(tmp_path)
+    launch("simulator_node", domain_id, mode="lockstep", **simulated)
+    options = {"domain_id": domain_id, "timeout_s": TIMEOUT_S} | options
+    here = BridgeEnv(model=model, estimator=True, **arguments)
+    there = BridgeEnv("dds", model, backend_options=options, **arguments)
     with closing(there):
-        drive_alike(here, there)
-
-
-def test_a_randomised_episode_over_dds_is_the_one_in_process(launch, model, domain_id):
-    launch("simulator_node", domain_id, mode="lockstep", randomisation="strong")
-    options = {"backend_options": {"domain_id": domain_id}}
-    here = BridgeEnv(model=model, randomisation="strong", estimator=True)
-    with closing(BridgeEnv("dds", model, randomisation="strong", **options)) as there:
-        drive_alike(here, there)
-    with (
-        closing(BridgeEnv("dds", model, randomisation="mild", **options)) as env,
-        pytest.raises(ModelError, match="start both with the same randomisation"),
-    ):
-        env.reset(seed=3)
-
-
-def drive_alike(here, there):
-    for seed in (3, 4):
-        assert (here.reset(seed=seed)[0] == there.reset(seed=seed)[0]).all()
-        for k in range(5):
-            action = np.full(here.action_space.shape, 0.1 * k, np.float32)
-            mine = here.step(action)
-            theirs = there.step(action)
-            assert (mine[0] == theirs[0]).all()
-            assert mine[1] == theirs[1]
+        drive_alike(here, there, (0, 1, 2, 2, 2**31 - 1))
 
 
 def test_each_view_is_of_the_step_and_one_control_period_after_the_last(connect, model):
@@ -212,57 +136,38 @@ def test_each_view_is_of_the_step_and_one_control_period_after_the_last(connect,
     drive(backend)
 
 
-@pytest.mark.parametrize("topic", ["odom", "scan"])
-def test_what_is_lost_on_the_way_is_asked_for_again_and_counts_once(
-    connect, monkeypatch, topic
+@pytest.mark.parametrize("lost", [["odom"], ["scan"], ["scan", "request"]])
+def test_what_is_lost_on_the_way_is_requested_again_and_counts_once(
+    connect, monkeypatch, lost
 ):
     backend = connect()
     drive(backend)
     whole = backend.step(np.array([0.5, 0.1]))
     drive(backend)
     put = backend._inbox.put
-    lost = []
+    call = backend._episodes._repeat.call_async
+    left = list(lost)
 
-    def lossy(kind, message):
-        if kind == topic and not lost:
-            lost.append(kind)
-        else:
-            put(kind, message)
-
-    monkeypatch.setattr(backend._inbox, "put", lossy)
-    holed = backend.step(np.array([0.5, 0.1]))
-    assert lost == [topic]
-    for name in ("pose", "twist", "ranges"):
-        assert np.array_equal(getattr(holed[0], name), getattr(whole[0], name)), name
-    assert holed[1][f"{topic}_stamp_ns"] == holed[1]["stamp_ns"]
-
-
-def test_a_lost_asking_is_made_again(connect, monkeypatch):
-    backend = connect()
-    drive(backend)
-    put = backend._inbox.put
-    ask = backend._episodes._repeat.call_async
-    lost = []
-
-    def lossy(kind, message):
-        if kind == "scan" and "scan" not in lost:
-            lost.append(kind)
-            return None
-        return put(kind, message)
-
-    def deaf(request):
-        if "asking" not in lost:
-            lost.append("asking")
-            return Future()
-        return ask(request)
+    def lose(what):
+        if what in left:
+            left.remove(what)
+            return True
+        return False
 
     monkeypatch.setattr("nics_drl_bridge.nodes.link.LOST_S", 0.1)
-    monkeypatch.setattr(backend._inbox, "put", lossy)
-    monkeypatch.setattr(backend._episodes._repeat, "call_async", deaf)
-    view, facts = backend.step(np.array([0.5, 0.1]))
-    assert lost == ["scan", "asking"]
-    assert view.scan_age_s == 0.0
-    assert facts["scan_stamp_ns"] == facts["stamp_ns"]
+    monkeypatch.setattr(
+        backend._inbox, "put", lambda topic, m: lose(topic) or put(topic, m)
+    )
+    monkeypatch.setattr(
+        backend._episodes._repeat,
+        "call_async",
+        lambda request: Future() if lose("request") else call(request),
+    )
+    holed = backend.step(np.array([0.5, 0.1]))
+    assert left == []
+    for name in ("pose", "twist", "ranges"):
+        assert np.array_equal(getattr(holed[0], name), getattr(whole[0], name)), name
+    assert holed[1][f"{lost[0]}_stamp_ns"] == holed[1]["stamp_ns"]
 
 
 @pytest.mark.parametrize("topic", ["odom", "scan", "ground_truth"])
@@ -281,16 +186,14 @@ def test_a_message_that_cant_be_read_is_told_with_its_topic(
     drive(backend)
 
 
-def test_facts_of_a_fleet_have_one_shape_whatever_their_values():
-    for later in (3, 4):
-        facts = [
-            {"stamp_ns": 7, "scan_stamp_ns": stamp, "covariance": np.eye(3)}
-            for stamp in (3, later)
-        ]
-        found = stack_facts(facts)
-        assert found["stamp_ns"] == 7
-        assert found["scan_stamp_ns"].tolist() == [3, later]
-        assert found["covariance"].shape == (2, 3, 3)
+def test_facts_of_a_fleet_are_stacked_except_the_time_that_all_share():
+    facts = [{"stamp_ns": 7, "covariance": k * np.eye(3)} for k in range(2)]
+    stacked = stack_facts(facts)
+    assert stacked["stamp_ns"] == 7
+    assert stacked["covariance"].tolist() == [
+        np.zeros((3, 3)).tolist(),
+        np.eye(3).tolist(),
+    ]
 
 
 def test_after_a_failed_step_a_command_asks_for_a_reset(connect, monkeypatch):
@@ -308,14 +211,16 @@ def test_after_a_failed_step_a_command_asks_for_a_reset(connect, monkeypatch):
     drive(backend)
 
 
-@pytest.mark.parametrize("wrong", ["model", "world"])
-def test_a_simulator_of_another_model_or_world_is_refused(connect, arena, wrong):
-    other = builtin_model("differential")
-    if wrong == "world":  # even under the same name
-        other = arena.model_copy(update={"size": (6.0, 6.5)})
-    backend = connect(**{wrong: other})
-    with pytest.raises(ModelError, match=f"'{other.fingerprint}'.*same {wrong}"):
-        backend.reset(START)
+def test_a_simulator_of_another_model_world_or_randomisation_is_refused(connect, arena):
+    for wrong, other in (
+        ("model", builtin_model("differential")),
+        ("world", arena.model_copy(update={"size": (6.0, 6.5)})),  # of the same name
+        ("randomisation", load_randomisation("mild")),
+    ):
+        backend = connect(**{wrong: other})
+        with pytest.raises(ModelError, match=f"'{other.fingerprint}'.*same {wrong}"):
+            backend.reset(START)
+        backend.close()
 
 
 def test_without_a_simulator_the_error_names_all_that_is_missing(
@@ -391,29 +296,31 @@ def test_somebody_else_who_moves_the_simulator_is_found_out(
     drive(backend)
 
 
-@pytest.mark.process
 def test_a_simulator_that_hangs_serves_again_when_it_wakes_and_its_death_is_noticed(
-    own_simulator,
+    launch, meet, domain_id, model, arena
 ):
-    backend, process, _ = own_simulator
-    drive(backend)
-    process._process.send_signal(signal.SIGSTOP)
-    backend.timeout_s = 0.5
-    hung_ns = backend._now_ns
-    with pytest.raises(StaleDataError):
-        backend.step(np.array([0.5, 0.0]))
-    process._process.send_signal(signal.SIGCONT)
-    backend.timeout_s = TIMEOUT_S
-    drive(backend)
-    assert backend._now_ns > hung_ns
-    process._process.kill()
-    backend.timeout_s = SHORT_S
-    with pytest.raises(StaleDataError, match="no fresh data within 2") as caught:
-        backend.step(np.array([0.5, 0.0]))
-    assert caught.value.topic == "odom"
-    assert SHORT_S < caught.value.age_s < 60.0
-    with pytest.raises(BackendError, match="no answer within 2 s"):
-        backend.reset(START)
+    process = launch("simulator_node", domain_id, namespace=NAMESPACE, mode="lockstep")
+    options = {"namespace": NAMESPACE, "domain_id": domain_id, "timeout_s": TIMEOUT_S}
+    with closing(DdsBackend(model, arena, **options)) as backend:
+        drive(backend)
+        pause = partial(meet(domain_id).call, SetBool, f"{NAMESPACE}/{PAUSE}")
+        pause(SetBool.Request(data=True))
+        backend.timeout_s = 0.5
+        hung_ns = backend._now_ns
+        with pytest.raises(StaleDataError):
+            backend.step(np.array([0.5, 0.0]))
+        pause(SetBool.Request(data=False))
+        backend.timeout_s = TIMEOUT_S
+        drive(backend)
+        assert backend._now_ns > hung_ns
+        process.close()
+        backend.timeout_s = SHORT_S
+        with pytest.raises(StaleDataError, match="no fresh data within 2") as caught:
+            backend.step(np.array([0.5, 0.0]))
+        assert caught.value.topic == "odom"
+        assert SHORT_S < caught.value.age_s < 60.0
+        with pytest.raises(BackendError, match="no answer within 2 s"):
+            backend.reset(START)
 
 
 @pytest.mark.parametrize(

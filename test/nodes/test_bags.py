@@ -15,14 +15,14 @@ import bags
 import command_line
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.extras.bags.info import read_bag_info
 from nics_drl_bridge.middleware.playback import estimate
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.recording.bag_file import open_bag
-from nodes.peer import odometry as peer_odometry
-from nodes.peer import stamp_ns
+from nodes.peer import odometry, stamp_ns
 
 pytestmark = [pytest.mark.ros, pytest.mark.process, pytest.mark.timeout(240)]
 
@@ -31,7 +31,7 @@ SMALL_FILE = 100_000  # bytes
 
 
 def nics(domain_id, *words):
-    """The command line, as a process in a DDS domain."""
+    """Run the command line as a process in a DDS domain."""
     environment = os.environ | {
         "ROS_DOMAIN_ID": str(domain_id),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -47,16 +47,19 @@ def nics(domain_id, *words):
 
 
 def ended(process):
-    """What a command said, and its exit code."""
+    """Return what a command printed, and its exit code."""
     out, err = process.communicate(timeout=ENDS_S)
     assert "Traceback" not in err
     return out, err, process.returncode
 
 
 def small_drive(path):
-    """Two seconds of odometry and commands, at times that differ from topic to topic."""
+    """Write two seconds of odometry and commands, at different times."""
     topics = {
-        "/odom": [(t + 0.01, odometry(t)) for t in bags.times(0.05, 2.0)],
+        "/odom": [
+            (t + 0.01, bags.moving_odometry(t, bags.place_at(t), (0.5, 0.0, 0.25)))
+            for t in bags.times(0.05, 2.0)
+        ],
         "/cmd_vel": [
             (t + 0.013, bags.twist(0.5, 0.0, 0.1 * np.sin(t)))
             for t in bags.times(0.1, 2.0)
@@ -65,20 +68,8 @@ def small_drive(path):
     return bags.write(path, topics)
 
 
-def odometry(t):
-    inner = bags.new(
-        "geometry_msgs/PoseWithCovariance", bags.pose(*bags.place_at(t)), np.zeros(36)
-    )
-    twist = bags.new(
-        "geometry_msgs/TwistWithCovariance", bags.twist(0.5, 0.0, 0.25), np.zeros(36)
-    )
-    return bags.new(
-        "nav_msgs/msg/Odometry", bags.header(t, "odom"), "base_link", inner, twist
-    )
-
-
 class Robot:
-    """Says what the test wants to be recorded."""
+    """Publishes what is to be recorded."""
 
     def __init__(self, peer):
         self.peer = peer
@@ -87,11 +78,11 @@ class Robot:
         self.command = peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
 
     def until(self, condition, what):
-        """Publishes until something is the case."""
+        """Publish until a condition holds."""
 
         def met():
             stamp = self.peer.node.get_clock().now().nanoseconds
-            self.odom.publish(peer_odometry(stamp))
+            self.odom.publish(odometry(stamp))
             self.command.publish(conversions.twist_to_ros([0.1, 0.0, 0.0]))
             self.sent += 1
             return condition()
@@ -122,7 +113,7 @@ def test_a_recorder_writes_a_whole_bag_at_ctrl_c(meet, domain_id, tmp_path):
 
 
 def count_on_disk(folder):
-    """Messages of an unfinished bag that are on the disk."""
+    """Count the messages of an unfinished bag that are on the disk."""
     unfinished = list(folder.glob(".drive.*/drive"))
     if not unfinished or not any(
         file.stat().st_size > 20_000 for file in unfinished[0].iterdir()
@@ -137,7 +128,7 @@ def count_on_disk(folder):
 def test_a_recorder_flushes_and_tells_where_the_bag_lies_once_the_storage_is_full(
     storage, meet, domain_id, tmp_path
 ):
-    """What was flushed is there, whatever ends the recorder."""
+    """What was flushed stays, whatever ends the recorder."""
     robot = Robot(meet(domain_id))
     place = tmp_path / "drive"
     recorder = nics(domain_id, "bag", "record", place, "--storage", storage)
@@ -155,20 +146,32 @@ def test_a_recorder_flushes_and_tells_where_the_bag_lies_once_the_storage_is_ful
     assert bags.unfinished_messages(left) > 10
 
 
-def test_a_bag_is_published_with_its_time_on_the_clock(meet, domain_id, tmp_path):
-    from rosgraph_msgs.msg import Clock
+@pytest.fixture
+def replay(domain_id, monkeypatch, tmp_path):
+    """Replays a bag in this process, `replay(bag, *options)`; returns what is printed."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
 
+    def run(*words):
+        done = command_line.nics("bag", "replay", *words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    yield run
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_a_bag_is_published_with_its_time_on_the_clock(
+    replay, meet, domain_id, tmp_path
+):
     bag = small_drive(tmp_path / "bag")
     peer = meet(domain_id)
     odom, clock = peer.listen(Odometry, "odom", 100), peer.listen(Clock, "/clock", 1000)
-    player = nics(domain_id, "bag", "replay", bag, "--rate", "0.5", "--json")
-    peer.until(lambda: len(odom) >= 40, "the whole bag", ENDS_S)
-    out, err, code = ended(player)
-    assert code == 0, err
-    assert json.loads(out) == {"published": 60}
-    assert [stamp_ns(message) for message in odom] == [
-        bags.ns(t) for t in bags.times(0.05, 2.0)
-    ]
+    assert json.loads(replay(bag, "--rate", "0.5", "--json")) == {"published": 60}
+    peer.until(lambda: len(odom) >= 40, "the whole bag")
+    wanted = [bags.ns(t) for t in bags.times(0.05, 2.0)]
+    assert list(map(stamp_ns, odom)) == wanted
     ticks = [conversions.stamp_from_ros(message.clock) for message in clock]
     assert ticks == sorted(ticks)
     assert bags.ns(0.0) <= ticks[0]
@@ -176,18 +179,16 @@ def test_a_bag_is_published_with_its_time_on_the_clock(meet, domain_id, tmp_path
 
 
 def test_a_replay_in_lock_step_gives_the_estimate_in_process_bit_for_bit(
-    launch, meet, domain_id, model, tmp_path
+    replay, launch, meet, domain_id, model, tmp_path
 ):
     bag = small_drive(tmp_path / "bag")
     peer = meet(domain_id)
     filtered = peer.listen(Odometry, "odometry/filtered", 100)
     launch("middleware_node", domain_id, use_sim_time=True)
     peer.be_known_to("middleware_node")
-    player = nics(domain_id, "bag", "replay", bag, "--lockstep", "middleware_node")
-    peer.until(lambda: len(filtered) >= 40, "all estimates", 2 * ENDS_S)
-    out, err, code = ended(player)
-    assert code == 0, err
-    assert out.splitlines() == ["60 messages were published"]
+    printed = replay(bag, "--lockstep", "middleware_node")
+    assert printed.splitlines() == ["60 messages were published"]
+    peer.until(lambda: len(filtered) >= 40, "all estimates")
     made = estimate(bag, model, {})
     assert list(map(stamp_ns, filtered)) == list(made.stamp_ns)
     twists = [conversions.odometry_from_ros(message)[1] for message in filtered]

@@ -10,7 +10,7 @@ from rclpy.parameter import Parameter
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.nodes.command_gate import declare_black_box, declare_gate
+from nics_drl_bridge.nodes.command_gate import declare_gate, find_black_box
 from nics_drl_bridge.nodes.runner import declare_model
 
 pytestmark = pytest.mark.ros
@@ -78,7 +78,9 @@ def test_the_shield_needs_the_wheelbase_of_a_car_and_can_be_turned_off(declared)
 
 def test_each_namespace_has_a_black_box_of_its_own(make_node, tmp_path):
     def folder(*words):
-        return declare_black_box(make_node(f"black_box:={tmp_path}", words=words))
+        node = make_node(f"black_box:={tmp_path}", words=words)
+        declare_gate(node, declare_model(node))
+        return find_black_box(node)
 
     assert folder() == tmp_path
     assert folder("-r", "__ns:=/hall/robot_1") == tmp_path / "hall" / "robot_1"

@@ -4,15 +4,15 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import closing
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-from geometry_msgs.msg import Twist
-
 from nics_drl_bridge.nodes import own_process
-from nodes.test_command_gate import PATIENT, Robot
+from nics_drl_bridge.nodes.faulty_robot import Robot
 
 pytestmark = [pytest.mark.ros, pytest.mark.process]
 
@@ -49,19 +49,19 @@ FURTHER_ENDS = [
 
 
 def rarely(number):
-    """A signal of the campaign."""
+    """Mark a signal for the campaign."""
     return pytest.param(number, marks=pytest.mark.campaign)
 
 
 def usual_signals():
-    """As in a terminal, whatever the shell that started the tests ignores."""
+    """Let signals end the process, whatever the shell that started the tests ignores."""
     for number in (signal.SIGRTMAX, *FURTHER_ENDS):
         signal.signal(number, signal.SIG_DFL)
 
 
 @pytest.fixture
 def node(domain_id):
-    """A node that says when it runs, and when it is stopped in order."""
+    """A node that prints when it runs, and when it is stopped in order."""
     process = subprocess.Popen(
         [sys.executable, "-c", NODE],
         env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
@@ -114,15 +114,15 @@ def test_a_node_below_nohup_goes_on_without_its_terminal(domain_id):
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, rarely(signal.SIGQUIT)])
 def test_a_gate_that_lets_a_robot_drive_leaves_a_zero_behind(
-    launch_process, meet, domain_id, model, tmp_path, number
+    launch_process, domain_id, model, tmp_path, number
 ):
     if signal.getsignal(number) is signal.SIG_IGN:
         pytest.skip("the shell that started the tests ignores it")
-    given = {"limits": "ackermann", "black_box": str(tmp_path), **PATIENT}
+    given = {"limits": "ackermann", "black_box": str(tmp_path), "stop_when_held": False}
     gate = launch_process("command_gate", domain_id, **given)
-    robot = Robot(meet(domain_id), model.lidar)
-    robot.drives()
-    gate._process.send_signal(number)
-    robot.peer.until(lambda: gate._process.poll() is not None, "its end")
-    assert gate._process.returncode == 0
-    robot.peer.until(lambda: robot.passed[-1] == Twist(), "zero", 5.0)
+    with closing(Robot(domain_id, model, np.array([0.5, 0.0, 0.0]))) as robot:
+        robot.drive()
+        gate._process.send_signal(number)
+        assert robot.until(lambda: gate.poll() is not None, DEADLINE_S)
+        assert gate.poll() == 0
+        assert robot.until(lambda: not robot.moves, 5.0)

@@ -13,10 +13,7 @@ from nics_drl_bridge.defaults import EPISODE_STEPS
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.registry import NAVIGATION
 from nics_drl_bridge.env.sim_backend import SimBackend
-from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.generator import builtin_model, save_model
-from nics_drl_bridge.interface import Start
-from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.policy.evaluation import drive_all
 from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.sim.world import load_world
@@ -24,7 +21,7 @@ from nics_drl_bridge.sim.world import load_world
 pytestmark = pytest.mark.ros
 
 TIMEOUT_S = 60.0
-SEEDS = (11, 12)
+SEEDS = (11,)
 # node -> library, its extra, and the name in sentences
 ENGINES = {
     "dart_node": ("dartpy", "dart", "DART"),
@@ -92,17 +89,6 @@ def test_whole_episodes_over_topics_reach_the_goal_as_in_this_process(node, robo
     for one, other in zip(over_topics, in_process, strict=True):
         assert np.array_equal(one.estimate, other.estimate)
         assert np.abs(one.path - other.path).max() < 1e-12
-
-
-@pytest.mark.process
-def test_it_refuses_to_be_taken_for_another_model(node, robot):
-    other = builtin_model("mecanum")
-    backend = DdsBackend(other, load_world("arena"), **node[1])
-    try:
-        with pytest.raises(ModelError, match="same model"):
-            backend.reset(Start(seed=0, pose=np.zeros(3)))
-    finally:
-        backend.close()
 
 
 @pytest.mark.parametrize("node", ENGINES)

@@ -1,7 +1,6 @@
-"""An env over DDS leaves a zero on `cmd_vel` whatever leaves one of its methods by an exception."""
+"""An env over DDS leaves a zero on `cmd_vel` when an exception leaves one of its methods."""
 
 import threading
-from contextlib import closing
 from types import SimpleNamespace
 
 import gymnasium
@@ -15,10 +14,7 @@ from geometry_msgs.msg import Twist
 from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION
 from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import link, qos
-from nics_drl_bridge.nodes.backends import DdsBackend
-from nics_drl_bridge.sim.world import load_world
 
 pytestmark = pytest.mark.ros
 
@@ -27,7 +23,7 @@ PATIENCE_S = 60.0
 
 
 class Thrower(Navigation):
-    """Drives as told until `error` is set, which then leaves whatever is called next."""
+    """Drives as commanded until `error` is set, which the next call raises."""
 
     thrown = SimpleNamespace(error=None, value=None)
 
@@ -45,7 +41,7 @@ class Thrower(Navigation):
 
 @pytest.fixture(scope="module")
 def simulators(launch, domains):
-    """The domain of a simulator for each mode."""
+    """Return the domain of a simulator for each mode."""
     from domains import claimed_domain
 
     found = {}
@@ -64,7 +60,7 @@ def simulators(launch, domains):
 
 @pytest.fixture(scope="module")
 def listeners(simulators, meet):
-    """What is heard on `cmd_vel` of each mode."""
+    """Return what is published on `cmd_vel` in each mode."""
     peers = {mode: meet(domain_id) for mode, domain_id in simulators.items()}
     return {
         mode: (peer, peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND))
@@ -74,7 +70,7 @@ def listeners(simulators, meet):
 
 @pytest.fixture
 def driving(simulators, listeners):
-    """Makes an env whose robot drives ahead, `driving(mode)`; it is known to who listens."""
+    """Make an env whose robot drives ahead, `driving(mode)`, and which listeners have found."""
     made = []
     Thrower.thrown.error = Thrower.thrown.value = None
 
@@ -121,36 +117,25 @@ def throw(error=None, value=None):
     Thrower.thrown.error, Thrower.thrown.value = error, value
 
 
-def task_raises(env):
-    throw(ZeroDivisionError("of the task"))
-    env.step(AHEAD)
-
-
-def task_says_nan(env):
+def say_nan(env):
     throw(value=np.nan)
     env.step(AHEAD)
 
 
-def interrupted(env):
+def interrupt(env):
     throw(KeyboardInterrupt())
     env.step(AHEAD)
 
 
-def task_raises_in_reset(env):
+def raise_in_reset(env):
     throw(ZeroDivisionError("of the task"))
     env.reset(seed=2)
 
 
 CASES = {
-    "step with NaN": (
-        lambda env: env.step(AHEAD * np.nan),
-        gymnasium.error.InvalidAction,
-    ),
-    "reset with a bad seed": (lambda env: env.reset(seed=-1), ConfigError),
-    "a task whose command raises": (task_raises, ZeroDivisionError),
-    "a task whose command is NaN": (task_says_nan, ConfigError),
-    "a task whose reset raises": (task_raises_in_reset, ZeroDivisionError),
-    "Ctrl-C in step": (interrupted, KeyboardInterrupt),
+    "a task whose command is NaN": (say_nan, ConfigError),
+    "a task whose reset raises": (raise_in_reset, ZeroDivisionError),
+    "Ctrl-C in step": (interrupt, KeyboardInterrupt),
 }
 
 
@@ -250,22 +235,3 @@ def test_one_robot_of_a_fleet_that_cant_be_halted_keeps_none_of_the_others_movin
         peer.until(lambda: all(each[-1] == Twist() for each in heard[::2]), "zeros")
     finally:
         deaf._link.close()
-
-
-def test_a_backend_publishes_nothing_that_is_not_finite(simulators, listeners, model):
-    peer, heard = listeners["lockstep"]
-    world = load_world("empty")
-    backend = DdsBackend(model, world, domain_id=simulators["lockstep"])
-    with closing(backend):
-        backend.reset(Start(seed=3, pose=np.zeros(3)))
-        heard.clear()
-        peer.until(
-            lambda: (
-                backend.step(np.array([0.5, 0.1])) and heard and heard[-1] != Twist()
-            ),
-            "that it drives",
-        )
-        with pytest.raises(BackendError, match="a zero was sent instead"):
-            backend.step(np.array([np.nan, -np.inf]))
-        peer.until(lambda: heard[-1] == Twist(), "a zero command")
-        assert np.isfinite([(one.linear.x, one.angular.z) for one in heard]).all()

@@ -37,7 +37,7 @@ def test_a_command_that_a_frozen_gate_had_written_before_does_not_count(monkeypa
     """The middleware may send it when the gate goes on."""
     ear, base = multiprocessing.Pipe(duplex=False)
     robot = Robot.__new__(Robot)
-    robot.mend()
+    robot.repair()
     robot.heard = []
     robot._ear = ear
     robot.spin = Mock()

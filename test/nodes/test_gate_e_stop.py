@@ -23,7 +23,7 @@ BESIDE_S = 0.001
 
 @contextmanager
 def heartbeats(publisher, period_s):
-    """Publishes "not pressed" at a period, in a thread of its own."""
+    """Publish "not pressed" at a period, in a thread."""
     over = threading.Event()
 
     def beat():
@@ -42,99 +42,76 @@ def heartbeats(publisher, period_s):
 class Operator:
     """A gate in a process of its own, and a button that the test presses."""
 
-    def __init__(self, gate, peer, beside):
+    def __init__(self, gate, peer):
         self.gate = gate
         self.peer = peer
         self.button = peer.speak(Bool, "e_stop", quality=qos.COMMAND)
-        self.beside = (
-            peer.speak(Bool, "e_stop", quality=qos.COMMAND) if beside else None
-        )
         self.said = peer.listen(DiagnosticArray, "/diagnostics")
 
     def finding(self):
-        """What the gate says next about itself."""
+        """Return the next message of the gate's diagnostics."""
         return self.peer.another(self.said, "diagnostics").status[0].message
 
-    def beat(self, seconds):
-        """Reports "not pressed" at 100 Hz for a while."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.button.publish(Bool(data=False))
-            time.sleep(HEARTBEAT_S)
-
     def stall_gate(self, seconds, press):
-        """Freezes the gate for some time, at whose beginning the button may be pressed briefly."""
+        """Freeze the gate for some time, at whose beginning the button may be pressed briefly."""
         self.gate._process.send_signal(signal.SIGSTOP)
         try:
-            self.beat(seconds / 10)
             if press:
                 self.button.publish(Bool(data=True))
-            self.beat(seconds)
+            with heartbeats(self.button, HEARTBEAT_S):
+                time.sleep(seconds)
         finally:
             self.gate._process.send_signal(signal.SIGCONT)
 
     def release(self):
-        """Resets the gate until nothing is latched; a late loss may latch it once more."""
+        """Reset the gate until nothing is latched; a late loss may latch it once more."""
 
-        def released():
+        def is_released():
             self.peer.call(Trigger, "command_gate/reset")
             return self.finding().startswith("disarmed")
 
-        self.peer.until(released, "nothing is latched")
+        self.peer.until(is_released, "nothing is latched")
 
 
-@pytest.fixture(
-    params=[
-        pytest.param(False, id="button_alone"),
-        pytest.param(True, id="1_kHz_beside"),
-    ]
-)
-def operator(request, launch_process, meet, domain_id):
-    gate = launch_process(
-        "command_gate", domain_id, limits="ackermann", e_stop_silence=5.0
-    )
-    made = Operator(gate, meet(domain_id), beside=request.param)
-    yield made
+@pytest.fixture(scope="module")
+def operator(launch_process, meet, module_domain_id):
+    given = {"limits": "ackermann", "e_stop_silence": 5.0}
+    gate = launch_process("command_gate", module_domain_id, **given)
+    yield Operator(gate, meet(module_domain_id))
     gate.check()
 
 
-@contextmanager
-def beating(operator):
-    """Both publishers report "not pressed"."""
-    with heartbeats(operator.button, HEARTBEAT_S), beside(operator):
-        yield
-
-
-@contextmanager
-def beside(operator):
-    """The second publisher reports "not pressed", if there is one."""
-    if operator.beside is None:
-        yield
+@pytest.fixture(params=[False, True], ids=["button_alone", "1_kHz_beside"])
+def beside(request, operator):
+    """Whether a second publisher reports "not pressed", too."""
+    if not request.param:
+        yield False
         return
-    with heartbeats(operator.beside, BESIDE_S):
-        yield
+    publisher = operator.peer.node.create_publisher(Bool, "e_stop", qos.COMMAND)
+    with heartbeats(publisher, BESIDE_S):
+        yield True
+    operator.peer.node.destroy_publisher(publisher)
 
 
 def judge(operator, stall_s, press):
-    """Stalls a gate on which nothing is latched, and waits for what it says afterwards."""
-    with beating(operator):
+    """Stall a gate on which nothing is latched, and wait for its diagnosis afterwards."""
+    with heartbeats(operator.button, HEARTBEAT_S):
         operator.release()
-    with beside(operator):
-        operator.stall_gate(stall_s, press)
-    said = "e_stop_pressed" if press else "disarmed"
-    with beating(operator):
-        operator.peer.until(lambda: operator.finding().startswith(said), said, 10.0)
+    operator.stall_gate(stall_s, press)
+    wanted = "e_stop_pressed" if press else "disarmed"
+    with heartbeats(operator.button, HEARTBEAT_S):
+        operator.peer.until(lambda: operator.finding().startswith(wanted), wanted, 10.0)
 
 
-def test_a_short_press_while_the_gate_is_stalled_stops_the_robot(operator):
+def test_a_short_press_while_the_gate_is_stalled_stops_the_robot(operator, beside):
     for stall_s in (0.15, 2.0):
         judge(operator, stall_s, press=True)
-    if operator.beside is None:  # and what the queue outlasts is no press
+    if not beside:  # and what the queue outlasts is no press
         judge(operator, 0.15, press=False)
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("stall_s", [0.15, 0.5])
-def test_no_press_is_lost_in_many_stalls(operator, stall_s):
+def test_no_press_is_lost_in_many_stalls(operator, beside, stall_s):
     for _ in range(10):
         judge(operator, stall_s, press=True)

@@ -42,24 +42,20 @@ def inject(tmp_path, *trials):
 
 @pytest.mark.process
 @pytest.mark.slow
-def test_a_gate_stops_in_time_and_without_it_nothing_does(tmp_path):
-    gated = replace(TWO, fault_kinds=("scan_silent",)).list_faults()[0]
-    kept, control = inject(tmp_path, gated, gated._replace(gated=False))
+def test_a_gate_stops_a_robot_whose_policy_dies_in_time_and_without_it_nothing_does(
+    tmp_path,
+):
+    (killed, *_), (silent, *_) = (
+        replace(TWO, fault_kinds=(kind,)).list_faults()
+        for kind in ("policy_killed", "scan_silent")
+    )
+    kept, control = inject(tmp_path, killed, silent._replace(gated=False))
     assert kept["in_time"]
     assert kept["time_s"] <= kept["limit_s"] == 0.4
     assert kept["unsafe"] == 0
+    assert (tmp_path / "policy_killed" / str(killed.seed) / "policy_node.log").exists()
     assert not control["in_time"]
     assert control["unsafe"] > 0
-
-
-@pytest.mark.process
-@pytest.mark.slow
-def test_the_policy_under_test_drives_the_robot_whose_policy_then_dies(tmp_path):
-    trial = replace(TWO, fault_kinds=("policy_killed",)).list_faults()[0]
-    (row,) = inject(tmp_path, trial)
-    assert row["in_time"]
-    log = tmp_path / "policy_killed" / str(trial.seed) / "policy_node.log"
-    assert log.exists()
 
 
 @pytest.mark.parametrize("textbook", ["ackermann", "tricycle"])

@@ -1,6 +1,7 @@
 import os
 import signal
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ NONSENSE = [np.nan, 0.0, 0.0]
 
 
 class Logger:
-    """Keeps the lines, by level."""
+    """Keeps the lines of each level."""
 
     def __init__(self):
         self.info_lines = []
@@ -42,7 +43,7 @@ class Logger:
 
 
 class Recorded(Rig):
-    """A rig that keeps all that the gate was given, and tells a log about it."""
+    """A rig that keeps all inputs of the gate, and passes them to a log."""
 
     def __init__(self, log=None):
         super().__init__()
@@ -108,18 +109,13 @@ def files(folder):
 
 
 def written(log, folder, count):
-    """The files, once there are so many."""
-    deadline = time.monotonic() + DEADLINE_S
-    while len(files(folder)) < count:
-        assert time.monotonic() < deadline, (
-            f"{len(files(folder))} of {count} files came"
-        )
-        time.sleep(0.01)
+    """Return the files, once there are so many."""
+    until(lambda: len(files(folder)) >= count)
     return files(folder)
 
 
 def until(condition):
-    """Waits until a condition holds."""
+    """Wait until a condition holds."""
     deadline = time.monotonic() + DEADLINE_S
     while not condition():
         assert time.monotonic() < deadline
@@ -141,35 +137,32 @@ def test_a_file_holds_what_there_was_at_the_stop_and_nothing_of_later(tmp_path, 
     assert again.entries[-1].now == rig.entries[stopped].now
 
 
-def test_of_a_burst_the_first_stop_is_written_and_the_others_are_counted(tmp_path, log):
+def test_of_a_burst_the_first_stop_of_a_rule_is_written_and_the_others_are_counted(
+    tmp_path, log
+):
     rig = Recorded(log).drive()
     first = rig.now
-    for _ in range(30):
+    for _ in range(10):
         rig.stop_by_nonsense()
         rig.go_on(0.3)
     (file,) = written(log, tmp_path, 1)
-    log.close()
-    assert files(tmp_path) == [file]
     assert file.name.endswith("_command_malformed.jsonl")
     assert replay(file).entries[-1].now - first < 0.3
-    assert log.counters["stopped, command_malformed"] == 30
-    assert log.counters["stops of a burst, not in the black box"] == 29
+    assert log.counters["stopped, command_malformed"] == 10
+    assert log.counters["stops of a burst, not in the black box"] == 9
     rig.go_on(BURST_S + 1.0)
     rig.stop_by_nonsense()
     assert len(written(log, tmp_path, 2)) == 2  # of the next burst
+    rig.go_on(0.3)
+    rig.run(1.0, without="scan")  # another rule
+    assert written(log, tmp_path, 3)[-1].name.endswith("_scan_silent.jsonl")
 
 
-def test_another_rule_is_written_though_a_burst_goes_on(tmp_path, log):
+def test_a_command_that_the_shield_cuts_is_counted(log):
     rig = Recorded(log).drive()
-    for _ in range(5):
-        rig.stop_by_nonsense()
-        rig.go_on(0.3)
-    rig.run(1.0, without="scan")
-    names = [file.name for file in written(log, tmp_path, 2)]
-    assert [name.split("_", 3)[3] for name in names] == [
-        "command_malformed.jsonl",
-        "scan_silent.jsonl",
-    ]
+    cut = replace(rig.decision, shielded=True)
+    log.note(Entry(rig.now, inputs.Tick(), rig.state, cut))
+    assert log.finding(rig.state).facts["cut by the shield"] == 1
 
 
 def test_a_burst_does_not_flood_the_log_and_what_is_the_case_is_said_in_the_end(

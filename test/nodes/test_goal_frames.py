@@ -23,7 +23,7 @@ TWIST = np.array([1.0, 0.0, 0.0])
 
 
 class Topics:
-    """Of a robot that drives at 1 m/s, whose odometry has another origin than the map."""
+    """Topics of a robot at 1 m/s, whose odometry has another origin than the map."""
 
     def __init__(self):
         self.frames = ("bot/odom", "bot/base")
@@ -54,7 +54,7 @@ def goal(frame, x, y):
 
 
 def mount(frames, parent, child, *pose):
-    """As a message on `/tf_static`, whose package need not be installed, tells of it."""
+    """Mount a frame as a message on `/tf_static` does, whose package may be missing."""
     each = TransformStamped(child_frame_id=child)
     each.header.frame_id = parent
     each.transform.translation.x, each.transform.translation.y = pose[:2]

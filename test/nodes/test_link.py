@@ -4,11 +4,14 @@ import os
 import signal
 import threading
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from geometry_msgs.msg import Twist
 
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import backends, link
@@ -102,6 +105,16 @@ def test_ctrl_c_at_any_moment_leaves_the_callbacks_running(domain_id):
     finally:
         robot.close()
         signal.signal(signal.SIGINT, before)
+
+
+def test_a_command_that_is_not_finite_is_never_published_but_a_zero(domain_id):
+    robot = Link(domain_id=domain_id, stamped=False)
+    sent = []
+    robot.commands = SimpleNamespace(publish=sent.append)
+    with pytest.raises(BackendError, match="a zero was sent instead"):
+        robot.send(np.array([0.5, 0.0, np.nan]))
+    assert sent == [Twist()]
+    robot.close()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

@@ -11,10 +11,9 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from nics_drl_bridge.commands.doctor import doctor
-from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.nodes import load, node_process
-from nics_drl_bridge.nodes.load import measure_load, read_memory_mb
+from nics_drl_bridge.nodes.load import read_memory_mb
 from nics_drl_bridge.nodes.processes import unused_domain_id
 
 pytestmark = [
@@ -38,18 +37,13 @@ with subprocess.Popen([sys.executable, "-c", {HOLD!r}]) as child:
 """
 
 
-def measure():
-    model = builtin_model("differential")
-    ((measured,), _) = measure_load(model, "straight", 2.0, (1.0,), (10.0,))
-    return measured
-
-
 def test_each_node_is_measured_while_commands_of_a_slow_policy_go_to_the_robot(
     monkeypatch,
 ):
     slow_down_policy(monkeypatch)
     cores = os.sched_getaffinity(0)
-    measured = measure()
+    model = builtin_model("differential")
+    ((measured,), _) = load.measure_load(model, "straight", 2.0, (1.0,), (10.0,))
     assert list(measured.cpu) == list(measured.memory_mb) == NODES
     assert all(0.0 < part < 1.0 for part in measured.cpu.values())
     assert all(30.0 < part < 1000.0 for part in measured.memory_mb.values())
@@ -68,11 +62,6 @@ def slow_down_policy(monkeypatch):
         return [*words, f"{path}\n{SLOW}\nfrom runpy{run}"]
 
     monkeypatch.setattr(node_process, "make_module_command", make_slow)
-
-
-def test_a_policy_that_is_none_ends_it_with_the_words_of_its_node():
-    with pytest.raises(BackendError, match="unknown policy 'nothing'"):
-        load.measure_load(builtin_model("differential"), "nothing", 1.0)
 
 
 def test_the_doctor_prints_what_was_measured(monkeypatch, capsys):

@@ -1,20 +1,21 @@
+import itertools
+
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
-from std_srvs.srv import Trigger
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.frames import (
     compute_odom_in_map,
     transform_from_ros,
     transform_to_ros,
 )
-from nodes.peer import odometry, pose_of, stamp_ns
+from nics_drl_bridge.nodes.middleware_node import MiddlewareNode
+from nodes.peer import odometry, pose_of
 
 pytestmark = pytest.mark.ros
 TFS = conversions.find_message_type("tf2_msgs/msg/TFMessage")
@@ -28,76 +29,56 @@ def test_odom_lies_in_the_map_so_that_both_tell_of_the_same_robot():
     assert geometry.compose(home, in_odom) == pytest.approx(in_map)
 
 
-@pytest.fixture
-def placed(launch, meet, domain_id):
-    """A middleware, a robot that the test plays, and a place for it."""
-    middleware = launch("middleware_node", domain_id)
-    peer = meet(domain_id)
-    filtered = peer.listen(Odometry, "odometry/filtered")
-    odom = peer.speak(Odometry, "odom")
-    poses = peer.speak(PoseWithCovarianceStamped, "initialpose")
-    numbers = iter(range(1, 1000))
+class Placed:
+    """A middleware whose robot drives along x at 0.2 m/s."""
 
-    def drive(x):
-        """An odometry at x [m], every tenth of a second at 0.2 m/s, and the estimate after it."""
-        stamp = next(numbers) * 100_000_000
-        odom.publish(odometry(stamp, [x, 0.0, 0.0], [0.2, 0.0, 0.0]))
-        if peer.within(5.0, lambda: filtered and stamp_ns(filtered[-1]) >= stamp):
-            return pose_of(filtered[-1])
-        return None
+    def __init__(self, direct):
+        self.robot = direct("model:=ackermann", kind=MiddlewareNode)
+        self._stamps = itertools.count(10**8, 10**8)
 
-    peer.until(lambda: drive(0.0) is not None, "the first estimate")
-    yield peer, middleware, poses, drive
-    middleware.check()
+    def drive(self, x):
+        """Give an odometry; return the estimate after it."""
+        moving = odometry(next(self._stamps), [x, 0.0, 0.0], [0.2, 0.0, 0.0])
+        self.robot.give("odom", moving)
+        return pose_of(self.robot.sent["odometry/filtered"][-1])
 
-
-def to(x, y, heading):
-    message = PoseWithCovarianceStamped()
-    message.header.frame_id = "map"
-    message.pose.pose.position.x, message.pose.pose.position.y = x, y
-    message.pose.pose.orientation = conversions.heading_to_ros(heading)
-    message.pose.covariance[0] = message.pose.covariance[7] = 0.25  # as RViz says
-    message.pose.covariance[35] = 0.07
-    return message
+    def put(self, x, y, heading):
+        message = PoseWithCovarianceStamped()
+        message.header.frame_id = "map"
+        message.pose.pose = conversions.pose_to_ros([x, y, heading], 0, "").pose
+        message.pose.covariance[0] = message.pose.covariance[7] = 0.25  # as RViz says
+        message.pose.covariance[35] = 0.07
+        self.robot.give("initialpose", message)
 
 
-def test_an_initial_pose_puts_the_estimate_there_and_it_goes_on_from_there(placed):
-    peer, middleware, poses, drive = placed
-    for k in range(1, 5):
-        drive(0.02 * k)
-    poses.publish(to(5.0, -1.0, np.pi / 2))
-    peer.until(
-        lambda: "the robot is at (5.00, -1.00) m" in middleware.log.read_text(), "heard"
-    )
-    last = [drive(0.08 + 0.02 * k) for k in range(1, 11)][-1]
+def test_an_initial_pose_puts_the_estimate_there_and_it_goes_on_from_there(direct):
+    placed = Placed(direct)
+    for k in range(5):
+        placed.drive(0.02 * k)
+    placed.put(5.0, -1.0, np.pi / 2)
+    last = [placed.drive(0.08 + 0.02 * k) for k in range(1, 11)][-1]
     assert last == pytest.approx([5.0, -0.8, np.pi / 2], abs=0.03)
-    assert peer.call(Trigger, "middleware_node/reset").success
-    assert drive(0.3) == pytest.approx([0.3, 0.0, 0.0], abs=0.03)  # forgotten, too
+    assert placed.robot.call("~/reset").success
+    assert placed.drive(0.3) == pytest.approx([0.3, 0.0, 0.0], abs=0.03)  # forgotten
 
 
 @needs_tf2_msgs
-def test_map_to_odom_follows_from_the_estimate_until_another_node_publishes_it(placed):
-    peer, middleware, poses, drive = placed
-    transforms = peer.listen(TFS, "/tf", qos.TRANSFORMS)
-    others = peer.speak(TFS, "/tf", quality=qos.TRANSFORMS)
-    peer.be_known_to("middleware_node")
-    poses.publish(to(5.0, -1.0, np.pi / 2))
-    peer.until(lambda: "the robot is at" in middleware.log.read_text(), "heard")
-    drive(0.0)
-    peer.until(lambda: drive(0.0) is not None and transforms, "a transform")
-    (one,) = transforms[-1].transforms
-    parent, child, home = transform_from_ros(one)
+def test_map_to_odom_follows_from_the_estimate_until_another_node_publishes_it(direct):
+    placed = Placed(direct)
+    placed.drive(0.0)
+    placed.put(5.0, -1.0, np.pi / 2)
+    placed.drive(0.0)
+    sent = placed.robot.sent["/tf"]
+    (ours,) = sent[-1].transforms
+    parent, child, home = transform_from_ros(ours)
     assert (parent, child) == ("map", "odom")
     assert home == pytest.approx([5.0, -1.0, np.pi / 2], abs=0.15)
+    placed.robot.give("/tf", sent[-1])  # its own
+    placed.drive(0.0)
+    known = len(sent)
     # as of a localiser that stamps as this one does
-    now_ns = conversions.stamp_from_ros(one.header.stamp)
-    others.publish(
-        TFS(transforms=[transform_to_ros("map", "odom", [9.0, 0.0, 0.0], now_ns)])
-    )
-    told = "another node publishes map -> odom"
-    peer.until(lambda: told in middleware.log.read_text(), "yielding")
-    known = len(transforms)
-    drive(0.0)
-    drive(0.0)
-    ours = [t for m in transforms[known:] for t in m.transforms]
-    assert all(each.transform.translation.x == 9.0 for each in ours)
+    stamp = conversions.stamp_from_ros(ours.header.stamp)
+    other = transform_to_ros("map", "odom", [9.0, 0.0, 0.0], stamp)
+    placed.robot.give("/tf", TFS(transforms=[other]))
+    placed.drive(0.0)
+    assert len(sent) == known

@@ -10,30 +10,14 @@ from nics_drl_bridge.nodes import listener
 from nics_drl_bridge.nodes import operator as module
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer
 from nics_drl_bridge.nodes.operator import GoalRequest, Operator, TriggerAnswer
+from nodes.direct import Clock
 
 pytestmark = pytest.mark.ros
 
 
-class Clock:
-    """Time that passes only while somebody sleeps."""
-
-    def __init__(self):
-        self.now = 0.0
-
-    def monotonic(self):
-        return self.now
-
-    def time_ns(self):
-        return round(self.now * 1e9)
-
-    def sleep(self, seconds):
-        self.now += seconds
-
-
 @pytest.fixture
 def clock(monkeypatch):
-    clock = Clock()
-    monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(module, "time", clock := Clock())
     return clock
 
 
@@ -69,7 +53,7 @@ def test_the_time_left_to_arm_is_told_and_kept(clock, monkeypatch):
     answer = operator.arm("", 10.0, False, told.append)
     assert told == ["/command_gate does not arm yet (x); asking again for 3 s"]
     assert not answer.granted
-    assert 7.0 + module.ASK_AGAIN_S < clock.now <= 10.0
+    assert 7.0 + module.ASK_AGAIN_S < clock.now_s <= 10.0
 
 
 @pytest.mark.parametrize("seconds", [0.0, 3.0])
@@ -90,7 +74,7 @@ def test_a_gate_that_hangs_holds_up_the_arming_no_longer_than_was_given(
     monkeypatch.setattr(module, "Call", Call)
     answer = operator.arm("", seconds, True, lambda _: None)
     assert answer == TriggerAnswer("/command_gate", False, "it did not answer in time")
-    assert clock.now == seconds
+    assert clock.now_s == seconds
 
 
 def test_a_goal_without_an_answer_takes_no_longer_than_was_given(clock, monkeypatch):
@@ -107,7 +91,7 @@ def test_a_goal_without_an_answer_takes_no_longer_than_was_given(clock, monkeypa
     monkeypatch.setattr(module, "holds", holds)
     answer = operator.send_goal("", GoalRequest(1.0, 0.0), 2.0, lambda _: None)
     assert answer == GoalAnswer(0, False, "no answer within 2.0 s, active")
-    assert clock.now == 2.0
+    assert clock.now_s == 2.0
 
 
 def test_a_stopped_robot_is_told_at_once_and_one_seen_later_is_stopped_too(
@@ -128,14 +112,14 @@ def test_a_stopped_robot_is_told_at_once_and_one_seen_later_is_stopped_too(
             return TriggerAnswer(self.gate, self.gate != hanging, "")
 
     def find_gates():
-        return {hanging} | {gate for gate, s in appearing.items() if s <= clock.now}
+        return {hanging} | {gate for gate, s in appearing.items() if s <= clock.now_s}
 
     operator = Operator.__new__(Operator)
     operator._node = None
     monkeypatch.setattr(operator, "_gates", find_gates)
     monkeypatch.setattr(module, "Call", Call)
     told = [
-        (answer.node, answer.granted, round(clock.now, 1))
+        (answer.node, answer.granted, round(clock.now_s, 1))
         for answer in operator.stop(None, 5.0)
     ]
     assert told == [

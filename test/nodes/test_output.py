@@ -1,4 +1,4 @@
-"""A node never waits for who reads its output; what is too much is dropped."""
+"""A node never waits for whoever reads its output; what does not fit is dropped."""
 
 import contextlib
 import os
@@ -31,12 +31,18 @@ leave(3)
 """
 
 
+FREEZE = """import signal
+from nics_drl_bridge.nodes import own_process
+own_process._forwarders[0].send_signal(signal.SIGSTOP)
+for number in"""
+
+
 def start(code, *words, **outputs):
     return subprocess.Popen([sys.executable, "-c", code, *words], **outputs)
 
 
 def full_pipe():
-    """A pipe that takes nothing more until it is read."""
+    """Return a pipe that is full."""
     exit_, entrance = os.pipe()
     os.set_blocking(entrance, False)
     with contextlib.suppress(BlockingIOError):
@@ -47,7 +53,7 @@ def full_pipe():
 
 
 def read_all(descriptor):
-    """What can be read until the other side is closed."""
+    """Return what can be read until the other side is closed."""
     text = b""
     while True:
         try:
@@ -87,13 +93,30 @@ def test_a_pipe_that_nobody_reads_delays_nothing():
     assert 1_000 < len(lines) < count
 
 
-def test_a_terminal_that_was_halted_delays_nothing():
+@contextlib.contextmanager
+def halted_terminal():
     master, slave = pty.openpty()
     termios.tcflow(slave, termios.TCOOFF)  # as Ctrl-S
-    talker = start(TALKER, "30000", stdout=slave, stderr=slave)
+    yield slave
     os.close(slave)
-    assert talker.wait(DEADLINE_S) == 3
     os.close(master)
+
+
+@pytest.mark.parametrize("hanging", ["terminal", "log file", "forwarder"])
+def test_what_hangs_delays_nothing(tmp_path, hanging):
+    os.mkfifo(tmp_path / "file")  # nobody opens it for reading
+    words = [str(tmp_path / "file")] if hanging == "log file" else []
+    code = TALKER
+    if hanging == "forwarder":
+        code = code.replace("for number in", FREEZE, 1)
+        code = code.replace("leave(3)", "own_process._forwarders[0].kill();leave(3)")
+    with halted_terminal() as terminal:
+        output = terminal if hanging == "terminal" else subprocess.DEVNULL
+        talker = start(code, "30000", *words, stdout=output, stderr=output)
+        assert talker.wait(DEADLINE_S) == 3
+    if words:
+        with open(words[0], "rb"):  # `tee` opens it too, and ends
+            pass
 
 
 def test_all_lines_are_in_the_log_file_though_who_read_the_output_has_gone(tmp_path):
@@ -106,30 +129,6 @@ def test_all_lines_are_in_the_log_file_though_who_read_the_output_has_gone(tmp_p
     assert talker.wait(DEADLINE_S) == 3
     lines = (tmp_path / "log" / "file").read_text().splitlines()
     assert [line.split(" .")[0] for line in lines] == LINES
-
-
-def test_a_log_file_that_hangs_delays_nothing(tmp_path):
-    os.mkfifo(tmp_path / "file")  # nobody opens it for reading
-    log = str(tmp_path / "file")
-    nobody = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    assert start(TALKER, "30000", log, **nobody).wait(DEADLINE_S) == 3
-    with open(log, "rb"):  # `tee` opens it, too, and ends
-        pass
-
-
-def test_a_forwarder_that_is_frozen_or_killed_delays_nothing():
-    code = (
-        "import os, signal\nfrom nics_drl_bridge.nodes import own_process\n"
-        "own_process.forward_output()\n"
-        "os.kill(own_process._forwarders[0].pid, signal.{})\n"
-        "for _ in range(100_000): print('line', 'x' * 80, flush=True)\n"
-        "own_process._forwarders[0].kill()\nos._exit(3)"
-    )
-    for name in ("SIGSTOP", "SIGKILL"):
-        talker = start(
-            code.format(name), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        assert talker.wait(DEADLINE_S) == 3
 
 
 ERRORS = """

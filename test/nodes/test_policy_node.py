@@ -1,4 +1,3 @@
-import itertools
 import math
 
 import numpy as np
@@ -23,7 +22,7 @@ RATE = 4.0
 
 @pytest.fixture(scope="module")
 def driving(launch, meet, module_domain_id):
-    """A policy whose commands move a simulator without a gate between, and what is said."""
+    """A policy whose commands move a simulator without a gate, and what is published."""
     peer = meet(module_domain_id)
     said = {
         "scan": peer.listen(LaserScan, "scan"),
@@ -82,77 +81,57 @@ def test_a_goal_by_topic_is_driven_to_and_stopped_at(driving):
     assert [raw.twist for raw in said["cmd_vel_raw"][known:]] == [Twist()] * 10
 
 
+@pytest.fixture
+def standing(direct):
+    """A policy node, and a function that publishes what a standing robot sees at a time."""
+
+    def make(*given):
+        robot = direct("rate:=0.0", "deadline:=5.0", *given, kind=PolicyNode)
+        lidar = robot.node._model.lidar
+        ranges = np.full(lidar.beams, 3.0, np.float32)
+
+        def look(tenths, pose=(0.0, 0.0, 0.0)):
+            """Return the command after a scan at a time [0.1 s]."""
+            stamp = tenths * NS_PER_S // 10
+            robot.give("odom", odometry(stamp, pose))
+            robot.give("scan", conversions.scan_to_ros(lidar, ranges, stamp, "laser"))
+            return robot.sent["cmd_vel_raw"][-1]
+
+        return robot, look
+
+    return make
+
+
 def test_a_goal_in_the_robots_frame_lies_ahead_of_it_and_one_in_no_known_frame_is_refused(
-    driving,
+    standing,
 ):
-    peer, said, goals, policy = driving
-    before = pose_of(said["ground_truth"][-1])
-    ahead = PoseStamped()
-    ahead.header.frame_id, ahead.pose.position.x = "car", 1.2
-    goals.publish(ahead)
-    peer.until(lambda: speed(said) > 0.1, "driving")
-    ahead.header.frame_id = "kitchen"
-    goals.publish(ahead)
-    peer.until(lambda: "'kitchen' is refused" in policy.log.read_text(), "a refusal")
-    assert "The previous goal stays" in policy.log.read_text()
-    peer.until(lambda: speed(said) == 0.0, "a stop")
-    truth = pose_of(said["ground_truth"][-1])
-    wanted = before[:2] + 1.2 * np.array([math.cos(before[2]), math.sin(before[2])])
-    assert math.dist(truth[:2], wanted) < 0.5
+    robot, look = standing("base_frame:=car")
+    look(10, (1.0, 2.0, math.pi / 2))
+    robot.give("goal_pose", conversions.pose_to_ros([1.2, 0.0, 0.0], 7, "car"))
+    assert robot.node._goal == pytest.approx([1.0, 3.2])
+    assert robot.diagnose().facts["newest goal"] == "(1.00, 3.20) m in the map"
+    robot.give("goal_pose", conversions.pose_to_ros([1.2, 0.0, 0.0], 8, "kitchen"))
+    assert robot.node._goal == pytest.approx([1.0, 3.2])
+    facts = robot.diagnose().facts
+    assert facts["newest goal taken"] == "False"
+    assert "'kitchen' is refused" in facts["newest goal"]
+    assert look(11, (1.0, 2.0, math.pi / 2)).twist.linear.x > 0.0
 
 
-def test_with_a_pose_sensor_it_waits_until_it_knows_where_in_the_map_it_is(
-    launch, meet, domain_id
-):
-    peer = meet(domain_id)
-    start = {"episode_start": [-2.0, 0.0, 0.0]}
-    simulator = launch("simulator_node", domain_id, world="empty", **start)
-    policy = launch("policy_node", domain_id, pose_type="PoseStamped", goal=[0.0, 0.0])
-    raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
-    scans = peer.listen(LaserScan, "scan")
-    poses = peer.speak(PoseStamped, "pose")
-    peer.until(lambda: len(raw) >= 5 and scans, "commands and scans")
-    assert all(each.twist == Twist() for each in raw)
-    pose = PoseStamped(header=scans[-1].header)
-    pose.pose.position.x, pose.pose.orientation.w = -3.0, 1.0
-
-    def goes():
-        pose.header = scans[-1].header
-        poses.publish(pose)
-        return raw[-1].twist.linear.x > 0.1
-
-    peer.until(goes, "driving")
-    simulator.check()
-    policy.check()
+def test_with_a_pose_sensor_it_waits_until_it_knows_where_in_the_map_it_is(standing):
+    robot, look = standing("pose_type:=PoseStamped", "goal:=[2.0, 0.0]")
+    assert look(10).twist == look(11).twist == Twist()
+    robot.give("pose", conversions.pose_to_ros([0.0, 0.0, 0.0], 11 * 10**8, "map"))
+    assert look(12).twist.linear.x > 0.0
 
 
-def test_it_goes_on_after_a_simulation_has_set_the_clock_back(
-    launch, meet, domain_id, model
-):
-    policy = launch("policy_node", domain_id, rate=0.0)
-    peer = meet(domain_id)
-    commands = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
-    odom, scans = peer.speak(Odometry, "odom"), peer.speak(LaserScan, "scan")
-    goals = peer.speak(PoseStamped, "goal_pose")
-    goals.publish(conversions.pose_to_ros([3.0, 0.0, 0.0], 0, "map"))
-    ranges = np.full(model.lidar.beams, np.inf, np.float32)
-    tenths = itertools.count(1000)
-
-    def drives():
-        """A tenth of a second of a robot that stands; True once it is commanded to drive."""
-        stamp = next(tenths) * NS_PER_S // 10
-        odom.publish(odometry(stamp))
-        scans.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
-        peer.within(0.05, lambda: False)
-        return commands and commands[-1].twist.linear.x > 0.0
-
-    peer.until(drives, "it drives")
-    tenths = itertools.count(1)
-    commands.clear()
-    peer.until(
-        lambda: drives() and stamp_ns(commands[-1]) < 100 * NS_PER_S, "it drives on"
-    )
-    policy.check()
+def test_it_goes_on_after_a_simulation_has_set_the_clock_back(standing):
+    _, look = standing("goal:=[3.0, 0.0]")
+    for k in range(30):
+        assert look(1000 + k).twist.linear.x > 0.0
+    commands = [look(1 + k) for k in range(30)]
+    assert commands[-1].twist.linear.x > 0.0
+    assert stamp_ns(commands[-1]) == 3 * NS_PER_S
 
 
 @pytest.mark.parametrize(

@@ -9,23 +9,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-from sensor_msgs.msg import LaserScan
-
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import node_process
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 pytestmark = [pytest.mark.ros, pytest.mark.process]
 
-NODES = ("simulator_node", "middleware_node", "policy_node", "command_gate")
-ABSOLUTE = {
-    "/clock",
-    "/tf",
-    "/tf_static",
-    "/diagnostics",
-    "/rosout",
-    "/parameter_events",
-}
 PARENT = """
 import sys, time
 from pathlib import Path
@@ -43,33 +32,6 @@ def alive(pid):
     except (FileNotFoundError, ProcessLookupError):
         return False
     return stat.rpartition(")")[2].split()[0] != "Z"
-
-
-def test_every_node_starts_in_its_namespace_and_ends_in_order(launch, meet, domain_id):
-    """Its names are relative and can be remapped."""
-    peer = meet(domain_id)
-    scans = peer.listen(LaserScan, "robot/lidar/front")
-    remap = {"scan": "lidar/front"}
-    started = {node: launch(node, domain_id, "robot", remap) for node in NODES}
-
-    def list_topics():
-        return {name for name, _ in peer.node.get_topic_names_and_types()} - ABSOLUTE
-
-    def running():
-        names = dict(peer.node.get_node_names_and_namespaces())
-        return scans and all(names.get(node) == "/robot" for node in NODES)
-
-    wanted = {"/robot/cmd_vel", "/robot/cmd_vel_raw", "/robot/odom"}
-    peer.until(running, "all nodes")
-    peer.until(lambda: wanted <= list_topics(), "the topics of commands and odometry")
-    topics = list_topics()
-    found = peer.node.get_service_names_and_types()
-    services = {name for name, _ in found if not name.startswith("/peer_")}
-    assert "/robot/scan" not in topics
-    assert all(name.startswith("/robot/") for name in topics | services)
-    for node, running_node in started.items():
-        assert running_node.close() == 0, node
-        assert "Traceback" not in running_node.read_text()
 
 
 def test_a_node_dies_with_its_parent_however_that_dies(tmp_path, domain_id, meet):

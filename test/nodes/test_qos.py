@@ -8,30 +8,20 @@ from std_msgs.msg import Bool
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.listener import open_context
-from nics_drl_bridge.nodes.qos import BridgeNode
 from nics_drl_bridge.nodes.runner import explain_ignored_values
 
 pytestmark = pytest.mark.ros
 
 
 @pytest.fixture
-def overridden(domain_id):
+def overridden(make_node):
     """Makes nodes with overrides, as `overridden("/scan.publisher.depth:=3")`."""
-    contexts = []
 
     def make(*overrides, remap=()):
-        words = ["node", "--ros-args"]
-        for each in overrides:
-            words += ["-p", f"qos_overrides.{each}"]
-        for each in remap:
-            words += ["-r", each]
-        contexts.append(open_context(words, domain_id))
-        return BridgeNode("node", context=contexts[-1])
+        given = [f"qos_overrides.{each}" for each in overrides]
+        return make_node(*given, words=[w for each in remap for w in ("-r", each)])
 
-    yield make
-    for context in contexts:
-        context.try_shutdown()
+    return make
 
 
 def test_overrides_of_a_publisher_and_a_subscription_are_honoured(overridden):
@@ -83,7 +73,7 @@ def test_an_override_that_can_not_be_is_refused_with_its_topic(overridden, overr
         node.create_publisher(Bool, "scan", qos.SENSOR_RELIABLE)
 
 
-def test_a_policy_that_does_not_exist_is_told_with_the_nearest(overridden):
+def test_a_policy_that_does_not_exist_is_ignored_with_a_sentence(overridden):
     node = overridden("/scan.publisher.reliabilty:=reliable")
     node.create_publisher(Bool, "scan", qos.SENSOR_RELIABLE)
     (line,) = explain_ignored_values(node)

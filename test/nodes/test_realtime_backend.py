@@ -9,20 +9,19 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-from geometry_msgs.msg import PoseStamped, TwistStamped
-from nav_msgs.msg import Odometry
-from sensor_msgs.msg import Imu, LaserScan
+from geometry_msgs.msg import TwistStamped
+from sensor_msgs.msg import Imu
 from std_srvs.srv import SetBool
 
 from nics_drl_bridge.env.registry import NAVIGATION
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.middleware.middleware import Datum
-from nics_drl_bridge.nodes import conversions, qos, realtime_backend
+from nics_drl_bridge.nodes import qos, realtime_backend
 from nics_drl_bridge.nodes.link import EpisodeServices
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.sim.world import load_world
-from nodes.peer import odometry
+from nodes.peer import PlayedRobot, stamp_ns
 
 pytestmark = pytest.mark.ros
 
@@ -33,19 +32,19 @@ FORWARD = np.array([0.5, 0.0])
 
 @pytest.fixture(scope="module")
 def simulator(launch, module_domain_id):
-    """The domain of a simulator in real time, and its process."""
+    """Return the domain of a simulator in real time."""
     process = launch("simulator_node", module_domain_id, mode="realtime")
-    yield module_domain_id, process
+    yield module_domain_id
     process.check()
 
 
 @pytest.fixture
 def connect(simulator, model):
-    """Makes backends on that simulator, or in the domain that is given."""
+    """Make backends on that simulator, or in a given domain."""
     made = []
 
     def make(**options):
-        options = {"domain_id": simulator[0], "timeout_s": PATIENCE_S} | options
+        options = {"domain_id": simulator, "timeout_s": PATIENCE_S} | options
         made.append(RealtimeBackend(model, load_world("arena"), **options))
         return made[-1]
 
@@ -56,22 +55,10 @@ def connect(simulator, model):
 
 @pytest.fixture
 def vehicle(meet, domain_id, model):
-    """The topics of a robot without services, and `stand(pose, twist)`, which tells where it is."""
-    peer = meet(domain_id)
-    odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
-    scan = peer.node.create_publisher(LaserScan, "scan", qos.SENSOR_RELIABLE)
-    sensor = peer.node.create_publisher(PoseStamped, "pose", qos.SENSOR_RELIABLE)
-    stamps = iter(range(10**9, 10**12, 10**8))
-
-    def stand(pose, twist=(0.0, 0.0, 0.0), stamp=None, scans=True):
-        stamp = next(stamps) if stamp is None else stamp
-        ranges = np.full(model.lidar.beams, 2.0, np.float32)
-        odom.publish(odometry(stamp, pose, twist))
-        if scans:
-            scan.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
-        sensor.publish(conversions.pose_to_ros(pose, stamp, "map"))
-
-    return SimpleNamespace(peer=peer, domain_id=domain_id, stand=stand)
+    """A robot without services; `send(pose, twist)` publishes its data."""
+    robot = PlayedRobot(meet(domain_id), model.lidar)
+    robot.domain_id = domain_id
+    return robot
 
 
 def drive_on(backend):
@@ -81,7 +68,7 @@ def drive_on(backend):
 
 def test_gymnasium_make_drives_a_simulator_in_real_time(simulator):
     options = {
-        "domain_id": simulator[0],
+        "domain_id": simulator,
         "mode": "realtime",
         "stale_after_s": PATIENCE_S,
     }
@@ -109,7 +96,7 @@ def test_silence_of_a_topic_is_named_with_its_age_and_a_reset_goes_on(
     backend = connect(stale_after_s=2.0)
     backend.reset(START)
     backend.step(FORWARD)
-    peer = meet(simulator[0])
+    peer = meet(simulator)
     peer.call(SetBool, "simulator_node/pause", SetBool.Request(data=True))
     with pytest.raises(StaleDataError, match=r"no fresh data within 2.000 s") as caught:
         drive_on(backend)
@@ -174,11 +161,11 @@ def test_a_vehicle_is_awaited_at_its_start_and_what_is_missing_is_said(
     def say(sentence):
         said.append(sentence.removeprefix("waiting for the robot: "))
         if said[-1].startswith("no "):
-            vehicle.stand(START.pose + np.array([1.0, 0.0, 0.5]))
+            vehicle.send(START.pose + np.array([1.0, 0.0, 0.5]))
         elif "off its start" in said[-1]:
-            vehicle.stand(START.pose, (0.3, 0.0, 0.0))
+            vehicle.send(START.pose, (0.3, 0.0, 0.0))
         else:
-            vehicle.stand(START.pose)
+            vehicle.send(START.pose)
 
     backend = connect(
         domain_id=vehicle.domain_id,
@@ -198,26 +185,26 @@ def test_a_vehicle_is_awaited_at_its_start_and_what_is_missing_is_said(
     backend.step(FORWARD)
     heard = "a command stamped with its scan"
     vehicle.peer.until(lambda: robot and robot[-1].twist.linear.x == 0.5, heard)
-    stamp_ns = backend._topics.middleware.cache.newest["scan"].stamp_ns
-    assert conversions.stamp_from_ros(robot[-1].header.stamp) == stamp_ns
+    newest_ns = backend._topics.middleware.cache.newest["scan"].stamp_ns
+    assert stamp_ns(robot[-1]) == newest_ns
     assert robot[-1].header.frame_id == "base_link"
 
 
 @pytest.fixture
 def standing(vehicle):
-    """The vehicle, which stands and sends; its clock is `offset_ns` ahead of the steady one."""
-    clock, over = SimpleNamespace(offset_ns=100 * 10**9), threading.Event()
+    """The vehicle, which sends all the time; its clock is `offset_ns` ahead of the steady one."""
+    vehicle.offset_ns, over = 100 * 10**9, threading.Event()
 
     def send():
         for tick in itertools.count():
             if over.wait(0.02):
                 return
-            stamp = time.monotonic_ns() + clock.offset_ns
-            vehicle.stand(np.zeros(3), stamp=stamp, scans=tick % 5 == 0)
+            stamp = time.monotonic_ns() + vehicle.offset_ns
+            vehicle.send(stamp=stamp, scans=tick % 5 == 0)
 
     thread = threading.Thread(target=send, daemon=True)
     thread.start()
-    yield SimpleNamespace(**vars(vehicle), clock=clock)
+    yield vehicle
     over.set()
     thread.join()
 
@@ -232,20 +219,16 @@ def test_a_drive_goes_on_after_the_clock_of_the_stamps_was_set_back(connect, sta
         stale_after_s=PATIENCE_S,
     )
     view = backend.reset(START)
-    standing.clock.offset_ns -= 50 * 10**9
+    standing.offset_ns -= 50 * 10**9
     deadline = time.monotonic() + PATIENCE_S
-    while view.stamp_s > (time.monotonic_ns() + standing.clock.offset_ns) / 1e9 + 1.0:
+    while view.stamp_s > (time.monotonic_ns() + standing.offset_ns) / 1e9 + 1.0:
         assert time.monotonic() < deadline, "the jump was not followed"
         view = backend.step(FORWARD)[0]
     assert not np.isnan(view.ranges).any()
     backend.step(FORWARD)
-
-    def answers_the_new_clock():
-        stamps = [conversions.stamp_from_ros(one.header.stamp) for one in heard]
-        return any(stamp <= view.stamp_s * 1e9 for stamp in stamps if stamp)
-
     standing.peer.until(
-        answers_the_new_clock, "a command with the stamp of a scan after the jump"
+        lambda: any(0 < stamp_ns(one) <= view.stamp_s * 1e9 for one in heard),
+        "a command with the stamp of a scan after the jump",
     )
 
 
@@ -272,7 +255,7 @@ def test_a_vehicle_that_does_not_come_ends_the_reset_and_the_present_pose_would_
         "domain_id": vehicle.domain_id,
         "command_topic": "cmd_vel_raw",
         "stale_after_s": PATIENCE_S,
-        "say": lambda _: vehicle.stand(np.zeros(3)),
+        "say": lambda _: vehicle.send(np.zeros(3)),
     }
     waiting = connect(**options, start_timeout_s=0.5)
     with pytest.raises(
@@ -281,28 +264,8 @@ def test_a_vehicle_that_does_not_come_ends_the_reset_and_the_present_pose_would_
         waiting.reset(START)
     waiting.close()
     present = connect(**options, start="present")
-    assert present.reset(START).pose == pytest.approx(np.zeros(3), abs=0.05)
-
-
-def test_a_start_that_fails_is_explained_by_its_cause(connect, vehicle):
-    vehicle.peer.listen(TwistStamped, "cmd_vel")
-    backend = connect(
-        domain_id=vehicle.domain_id,
-        stale_after_s=PATIENCE_S,
-        say=lambda _: None,
-        start_timeout_s=0.3,
-    )
-    with pytest.raises(BackendError, match="no scan yet; check that its pub") as silent:
-        backend.reset(START)
-
-    def is_heard():
-        vehicle.stand(START.pose, (0.3, 0.0, 0.0))
-        return np.isfinite(list(backend._measure_silences().values())).all()
-
-    vehicle.peer.until(is_heard, "the backend hears the vehicle")
-    with pytest.raises(BackendError, match="it is still moving; stop") as moves:
-        backend.present_pose()
-    assert "present" not in f"{silent.value} {moves.value}"
+    for pose in (present.reset(START).pose, present.present_pose()):
+        assert pose == pytest.approx(np.zeros(3), abs=0.05)
 
 
 def test_a_backend_that_is_closed_waits_no_longer_for_its_vehicle(connect, vehicle):

@@ -32,31 +32,30 @@ SHARE_OF_PATH = 0.1
 
 
 class FakeRobot:
-    """A robot that goes its own way: what it hears, and odometry of a pose that the test gives."""
+    """A robot that stands whatever it is told."""
 
-    def __init__(self, peer, kind=Twist):
+    def __init__(self, peer):
         self.peer = peer
-        self.heard = peer.listen(kind, "cmd_vel", qos.COMMAND)
+        self.heard = peer.listen(Twist, "cmd_vel", qos.COMMAND)
         self.odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
-        self.pose = [3.0, -2.0, 0.0]
         self.sent = 0.0
 
     def until(self, condition, what, deadline_s=DEADLINE_S):
-        """Publishes its pose 50 times a second until something is the case."""
+        """Publish its pose 50 times a second until a condition holds."""
 
         def met():
             if time.monotonic() - self.sent > 0.02:
                 self.sent = time.monotonic()
                 stamp = self.peer.node.get_clock().now().nanoseconds
-                self.odom.publish(odometry(stamp, self.pose))
+                self.odom.publish(odometry(stamp, [3.0, -2.0, 0.0]))
             return condition()
 
         self.peer.until(met, what, deadline_s)
 
     @property
     def driven(self):
-        """Whether it was told to drive."""
-        return bool(self.heard) and self.heard[-1] != self.heard[-1].__class__()
+        """Return whether it was told to drive."""
+        return bool(self.heard) and self.heard[-1] != Twist()
 
 
 def said(node):
@@ -94,93 +93,127 @@ def test_ctrl_c_leaves_a_zero_command_and_a_whole_recording(
     assert os.listdir(tmp_path) == ["drive.npz"]
 
 
-def test_sigterm_and_stamped_commands_in_a_namespace(launch, meet, domain_id, tmp_path):
-    robot = FakeRobot(meet(domain_id, "bot"), TwistStamped)
-    out = tmp_path / "drive.npz"
-    stamped = {"enable_stamped_cmd_vel": True}
-    node = launch("record_node", domain_id, "bot", out=str(out), **stamped)
-    robot.until(lambda: robot.heard and robot.heard[-1].twist != Twist(), "it drives")
-    assert conversions.stamp_from_ros(robot.heard[-1].header.stamp) > 0
-    node._process.send_signal(signal.SIGTERM)
-    robot.until(lambda: code_of(node) is not None, "it ends")
-    robot.peer.until(lambda: robot.heard[-1].twist == Twist(), "zero")
-    assert seconds(out) > 0.5
+class Drive:
+    """A record node on a clock of the test, and the odometry of its robot."""
+
+    def __init__(self, direct, clock, *given, words=()):
+        self._clock = clock
+        given = ("robot:=ackermann", *given)
+        self.robot = direct(*given, kind=record_node.RecordNode, words=words)
+        self.node = self.robot.node
+        self.sent = self.robot.sent["cmd_vel"]
+        self.stamp_s = clock.now_s
+
+    def run(self, seconds, y=-2.0, pace=1.0):
+        """Publish the pose 50 times a second, stamped at a pace."""
+        for _ in range(round(seconds * 50)):
+            if self.node.outcome is not None:
+                break
+            self._clock.now_s += 0.02
+            self.stamp_s += 0.02 * pace
+            message = odometry(round(self.stamp_s * 1e9), [3.0, y, 0.0])
+            self.robot.give("odom", message)
+            self.node._on_time()
+        return self
+
+    def wait(self, seconds):
+        self._clock.now_s += seconds
+        self.node._on_time()
 
 
-def test_silence_of_odometry_stops_the_robot(launch, meet, domain_id, tmp_path):
-    robot = FakeRobot(meet(domain_id))
-    out = tmp_path / "drive.npz"
-    node = launch("record_node", domain_id, out=str(out))
-    robot.until(lambda: robot.driven, "it drives")
-    robot.peer.until(lambda: code_of(node) is not None, "it ends without odometry")
-    assert code_of(node) == 2
-    robot.peer.until(lambda: robot.heard[-1] == Twist(), "zero")
-    sentence = (
-        f"topic '/odom' (namespace '/', ROS domain {domain_id}): nothing new for 0."
-    )
-    assert sentence in said(node)
-    assert seconds(out) > 0.5
+@pytest.fixture
+def open_drive(direct, clock, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    return lambda *given, **options: Drive(direct, clock, *given, **options)
 
 
-def test_leaving_the_bound_stops_the_robot(launch, meet, domain_id, tmp_path):
-    robot = FakeRobot(meet(domain_id))
-    out = tmp_path / "drive.npz"
-    node = launch("record_node", domain_id, out=str(out), bound=1.5)
-    robot.until(lambda: robot.driven, "it drives")
-    robot.pose = [3.0, -2.0 + 1.2, 0.0]  # still inside with its radius of 0.26 m
-    known = len(robot.heard)
-    robot.until(lambda: len(robot.heard) > known + 10, "it goes on")
-    assert code_of(node) is None
-    robot.pose = [3.0, -2.0 + 1.26, 0.0]
-    robot.until(lambda: code_of(node) is not None, "it ends")
-    robot.peer.until(lambda: robot.heard[-1] == Twist(), "zero")
-    assert code_of(node) == 2
-    assert "left its circle of 1.5 m, at x 0.00, y 1.26 m from the start" in said(node)
-    assert seconds(out) > 0.5
+def leave(drive):
+    drive.run(1.0, -2.0 + 1.2)  # still inside with its radius of 0.26 m
+    assert drive.node.outcome is None
+    drive.run(0.1, -2.0 + 1.26)
 
 
-def test_without_odometry_or_a_listener_it_says_where_it_looked(
-    launch, meet, domain_id, tmp_path, monkeypatch
+PLAIN = "enable_stamped_cmd_vel:=false"
+ENDS = {
+    "odometry falls silent": (
+        lambda drive: drive.wait(0.6),
+        "topic '/odom' .namespace '/', ROS domain .*: nothing new for 0.60 s .* 0.5 s",
+    ),
+    "the robot leaves": (
+        leave,
+        "left its circle of 1.5 m, at x 0.00, y 1.26 m from the start",
+    ),
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_a_fault_stops_the_robot_and_the_drive_is_saved(open_drive, end):
+    drive = open_drive(PLAIN, "bound:=1.5").run(3.0)
+    assert drive.sent[-1] != Twist()
+    act, sentence = ENDS[end]
+    act(drive)
+    outcome = drive.node.outcome
+    assert re.search(sentence, str(outcome.failure))
+    assert "the robot was told to stop" in outcome.line
+    assert drive.sent[-5:] == [Twist()] * 5
+    assert seconds("drive.npz") > 0.5
+
+
+def test_a_drive_sends_stamped_commands_in_the_frame_of_odometry_and_can_be_stopped(
+    open_drive,
 ):
-    monkeypatch.setattr(record_node, "PATIENCE_S", 2.0)
-    out = str(tmp_path / "drive.npz")
-    silent = launch("record_node", domain_id, "bot", {"odom": "wheel_odom"}, out=out)
-    peer = meet(domain_id)
-    unheard = FakeRobot(peer)
-    peer.node.destroy_subscription(next(iter(peer.node.subscriptions)))
-    deaf = launch("record_node", domain_id, out=out)
-    unheard.until(
-        lambda: None not in (code_of(silent), code_of(deaf)), "both end", 90.0
-    )
-    assert (code_of(silent), code_of(deaf)) == (2, 2)
-    where = f"(namespace '/bot', ROS domain {domain_id}): nothing arrived within 2 s"
-    assert f"topic '/bot/wheel_odom' {where}" in said(silent)
-    where = f"(namespace '/', ROS domain {domain_id}): nobody listened within 2 s"
-    assert f"topic '/cmd_vel' {where}" in said(deaf)
-    assert os.listdir(tmp_path) == []
+    drive = open_drive("enable_stamped_cmd_vel:=true").run(3.0)
+    assert drive.sent[-1].twist != Twist()
+    assert conversions.stamp_from_ros(drive.sent[-1].header.stamp) > 0
+    assert drive.sent[-1].header.frame_id == "base_link"
+    drive.node.stop()
+    assert drive.sent[-1].twist == Twist()
+    assert drive.node.outcome.line.startswith("interrupted: the robot was told to stop")
+    assert seconds("drive.npz") > 0.5
 
 
-def test_it_does_not_drive_a_robot_that_somebody_else_drives(
-    launch, meet, domain_id, tmp_path
+def test_a_simulator_that_is_faster_than_the_clock_is_noticed(open_drive):
+    drive = open_drive(PLAIN).run(1.5, pace=4.0)
+    sentence = r"stamps advanced by .* s within .*use_sim_time"
+    assert re.search(sentence, str(drive.node.outcome.failure))
+
+
+@pytest.mark.parametrize(
+    ("missing", "sentence"),
+    [
+        ("odometry", "topic '/bot/wheel_odom' (namespace '/bot', ROS domain "),
+        ("a listener", "topic '/bot/cmd_vel' (namespace '/bot', ROS domain "),
+        (
+            "a listener of its type",
+            "expects geometry_msgs/msg/TwistStamped there",
+        ),
+        ("the only driver", "topic '/bot/cmd_vel': 1 other publisher(s)"),
+    ],
+)
+def test_a_robot_that_can_not_be_driven_is_not_moved(
+    open_drive, meet, domain_id, monkeypatch, missing, sentence
 ):
-    robot = FakeRobot(meet(domain_id))
-    robot.peer.speak(Twist, "cmd_vel", 1)
-    node = launch("record_node", domain_id, out=str(tmp_path / "drive.npz"))
-    robot.until(lambda: code_of(node) is not None, "it ends")
-    assert "topic '/cmd_vel': 1 other publisher(s)" in said(node)
-    assert robot.heard == []
-
-
-def test_a_simulator_that_is_faster_than_the_clock_is_noticed(
-    launch, meet, domain_id, tmp_path
-):
-    launch("simulator_node", domain_id, world="empty", rate=4.0)
-    peer = meet(domain_id)
-    odom = peer.listen(Odometry, "odom")
-    peer.until(lambda: odom, "the simulator runs")
-    node = launch("record_node", domain_id, out=str(tmp_path / "drive.npz"))
-    peer.until(lambda: code_of(node) is not None, "it ends")
-    assert re.search(r"stamps advanced by .* s within .*use_sim_time", said(node))
+    words = ("-r", "__ns:=/bot", "-r", "odom:=wheel_odom")
+    drive = open_drive(PLAIN, words=words)
+    if "listener" in missing:
+        monkeypatch.setattr(drive.node._topic, "get_subscription_count", lambda: 0)
+    other = meet(domain_id)
+    if missing == "a listener of its type":
+        other.listen(TwistStamped, "/bot/cmd_vel")
+        other.until(lambda: drive.node.count_subscribers("/bot/cmd_vel"), "it")
+    if missing == "the only driver":
+        other.node.create_publisher(Twist, "/bot/cmd_vel", 1)
+        other.until(lambda: drive.node.count_publishers("/bot/cmd_vel") > 1, "it")
+    if missing != "odometry":
+        drive.run(0.1)
+    if missing != "the only driver":
+        assert drive.node.outcome is None
+        drive.wait(11.0)
+    outcome = drive.node.outcome
+    assert sentence in str(outcome.failure)
+    assert "the robot was not moved; nothing is recorded" in outcome.line
+    assert drive.sent == []
+    assert os.listdir() == []
 
 
 class Nics:
@@ -213,7 +246,7 @@ class Nics:
 
 @pytest.fixture
 def nics(tmp_path, domain_id):
-    """Starts `nics record`; it has ended after the test."""
+    """Start `nics record`; it ends with the test."""
     started = []
 
     def start(*options, **errors):

@@ -70,13 +70,9 @@ def test_an_argument_that_ros_does_not_know_is_one_sentence(domain_id):
 def test_a_value_that_can_not_be_used_is_refused_with_the_parameters_name(
     make_node, value
 ):
-    node = make_node(f"rate:={value}")
+    node = make_node(f"rate:={value}", "robots:=0")
     with pytest.raises(ParameterException, match="rate"):
         declare_row(node, Row("rate", 1.0, "Of time.", span=(0.1, 10.0)))
-
-
-def test_whole_numbers_have_ranges_too(make_node):
-    node = make_node("robots:=0")
     with pytest.raises(ParameterException, match=r"robots.*1"):
         declare_row(node, Row("robots", 1, "How many.", span=(1, 100)))
 
@@ -90,16 +86,11 @@ def test_a_description_and_a_range_are_told_to_ros2_param_describe(make_node):
     assert (span.from_value, span.to_value) == (0.1, 10.0)
 
 
-def test_a_misspelt_parameter_is_named_with_the_nearest_one(make_node):
-    node = make_node("command_timout:=2.0")
+def test_a_value_that_nothing_reads_is_named_with_the_nearest_parameter(make_node):
+    node = make_node("command_timout:=2.0", "qos_overrides./scam.publisher.depth:=3")
     declare_row(node, Row("command_timeout", 0.5, "Silence."))
-    (line,) = explain_ignored_values(node)
-    assert "'command_timout'" in line
-    assert "did you mean 'command_timeout'?" in line
-
-
-def test_a_quality_of_service_for_a_topic_that_the_node_has_not_is_told(make_node):
-    node = make_node("qos_overrides./scam.publisher.depth:=3")
     node.create_publisher(Bool, "/scan", 1)
-    (line,) = explain_ignored_values(node)
-    assert "'qos_overrides./scam.publisher.depth' is ignored" in line
+    misspelt, quality = explain_ignored_values(node)
+    assert "'command_timout'" in misspelt
+    assert "did you mean 'command_timeout'?" in misspelt
+    assert "'qos_overrides./scam.publisher.depth' is ignored" in quality

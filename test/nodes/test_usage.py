@@ -52,10 +52,8 @@ def test_defaults_are_written_as_they_are_given():
 def test_a_parameter_without_ros_args_is_one_sentence():
     done = run("policy_node", "policy:=mppi")
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == (
-        "policy_node: there is no argument 'policy:=mppi'; write parameters and remappings after "
-        "--ros-args, as in `policy_node --ros-args -p policy:=mppi`, or see `policy_node --help`.\n"
-    )
+    assert done.stderr == f"{find_fault('policy_node', ['policy:=mppi'])}\n"
+    assert "`policy_node --ros-args -p policy:=mppi`" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -69,7 +67,8 @@ def test_a_parameter_without_ros_args_is_one_sentence():
     ],
 )
 def test_the_first_word_that_is_not_for_ros_is_named(words, wrong):
-    assert (
-        f"there is no argument {wrong};" in find_fault("policy_node", words)
-    ) == bool(wrong)
-    assert bool(find_fault("policy_node", words)) == bool(wrong)
+    sentence = find_fault("policy_node", words)
+    assert sentence.startswith(
+        f"policy_node: there is no argument {wrong};" if wrong else ""
+    )
+    assert bool(sentence) == bool(wrong)

@@ -1,21 +1,18 @@
-"""Whatever ends a process that drives a robot, a zero command is the last that is heard of it."""
+"""Whatever ends a process that drives a robot, its last command is zero."""
 
 import os
 import signal
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import Twist, TwistStamped
-from nav_msgs.msg import Odometry
-from sensor_msgs.msg import LaserScan
 
-from nics_drl_bridge.nodes import conversions, qos
-from nodes.peer import odometry
+from nics_drl_bridge.nodes import qos
+from nodes.peer import PlayedRobot
 
 pytestmark = [pytest.mark.ros, pytest.mark.process]
 
@@ -63,25 +60,15 @@ def many(*given):
 
 @pytest.fixture
 def robot(meet, domain_id, model):
-    """Topics of a robot that stands at (5, 5), and what it hears."""
+    """A robot that stands at (5, 5), and `send`, which publishes its data."""
     peer = meet(domain_id)
-    odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
-    scan = peer.node.create_publisher(LaserScan, "scan", qos.SENSOR_RELIABLE)
-    ranges = np.full(model.lidar.beams, 2.0, np.float32)
-    stamps = iter(range(10**9, 10**12, 10**8))
-
-    def tell():
-        stamp = next(stamps)
-        odom.publish(odometry(stamp, [5.0, 5.0, 0.0]))
-        scan.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
-        return False
-
-    return peer, peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND), tell
+    played = PlayedRobot(peer, model.lidar)
+    return peer, lambda: played.send([5.0, 5.0, 0.0]) < 0
 
 
 @pytest.fixture
 def drive(domain_id):
-    """Starts a process that drives, `drive(what)`."""
+    """Start a process that drives, `drive(what)`."""
     started = []
 
     def start(what, driver=DRIVER):
@@ -103,13 +90,12 @@ def drive(domain_id):
         process.communicate()
 
 
-def said(process, text, told=""):
-    """Whether a process has said something."""
+def said(process, text):
+    """Return whether a process has just said something."""
     try:
-        told = process.stdout.read() or ""
+        return text in (process.stdout.read() or "")
     except (BlockingIOError, TypeError):
         return False
-    return text in told
 
 
 @pytest.mark.parametrize(
@@ -128,9 +114,10 @@ def said(process, text, told=""):
 def test_the_last_command_of_a_process_is_zero(
     robot, drive, what, until, signals, code
 ):
-    peer, heard, tell = robot
+    peer, send = robot
+    heard = peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND)
     process = drive(what)
-    peer.until(lambda: tell() or said(process, until), f"{what}: {until}", 60.0)
+    peer.until(lambda: send() or said(process, until), f"{what}: {until}", 60.0)
     for number in signals:
         process.send_signal(number)
         peer.until(lambda: True, "a moment")
@@ -239,7 +226,7 @@ policy_node.main([sys.argv[0], "--ros-args", "-p", "goal:=[8.0, 5.0]", "-p", "mo
     ["ValueError('of the policy')", many("SystemExit(3)"), many("MemoryError()")],
 )
 def test_a_policy_that_raises_leaves_a_zero_command_behind(robot, domain_id, error):
-    peer, _, tell = robot
+    peer, send = robot
     raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
     process = subprocess.Popen(
         [sys.executable, "-c", POLICY, error],
@@ -248,7 +235,7 @@ def test_a_policy_that_raises_leaves_a_zero_command_behind(robot, domain_id, err
         text=True,
     )
     try:
-        peer.until(lambda: tell() or process.poll() is not None, "its end", 200.0)
+        peer.until(lambda: send() or process.poll() is not None, "its end", 200.0)
         peer.until(lambda: raw and raw[-1].twist == Twist(), "a zero command")
         said = process.communicate()[1]
         assert process.returncode != 0

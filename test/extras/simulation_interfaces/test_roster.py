@@ -29,7 +29,7 @@ def model():
 
 @pytest.fixture
 def staged(model):
-    """The entities of a world of a name, in the first episode."""
+    """Make the entities of a named world, in its first episode."""
 
     def stage(name, robots=("car",)):
         world = load_worlds(name)
@@ -152,7 +152,7 @@ def test_starts_are_those_of_the_robots_that_are_still_there(staged):
 def test_room_for_what_was_spawned_is_given_back(staged):
     entities = staged("arena")
     room = entities.simulator.sampler.count
-    for k in range(3):
+    for k in range(2):
         entities.spawn(
             "disc", ((Circle(radius=0.1 + 0.05 * k), (0.0, 0.0, 0.0)),), START
         )
