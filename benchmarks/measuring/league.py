@@ -22,9 +22,8 @@ from scipy.ndimage import uniform_filter1d
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.calibration import Calibration, choose_half_width
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.motion import choose_half_width
 from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, select_windows
 from nics_drl_bridge.identify.shooting import HEADING_ARM_M
 from nics_drl_bridge.identify.signals import average_held, unwrap_headings
@@ -35,7 +34,6 @@ from nics_drl_bridge.identify.yardstick import (
     Yardstick,
     estimate_twists_at,
     probe_structure,
-    select_calm_windows,
 )
 from nics_drl_bridge.robot.taylor import evaluate
 
@@ -261,7 +259,9 @@ def fit_sysid(lesson: Lesson) -> Predictor:
 
     planar = build_planar(lesson)
     spacing = max(0.1, (lesson.until_s - HORIZON_S) / WINDOWS)
-    chosen, _ = select_calm_windows(lesson.drive, lesson.until_s, HORIZON_S, spacing)
+    chosen = select_windows(
+        lesson.drive, Calibration(), 0.0, lesson.until_s, HORIZON_S, spacing
+    )
     durations = np.tile(HORIZONS_S, (len(chosen.start_t), 1))
     at = chosen.start_t[:, None] + durations
     pose = unwrap_headings(lesson.drive.dated.values)

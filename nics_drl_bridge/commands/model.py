@@ -139,7 +139,7 @@ def drive_summary(recording: Any, parameters: dict[str, Any]) -> tuple[str, ...]
     """Returns text lines on the robot's path, the coverage of each command, and the next step."""
     import numpy as np
 
-    from nics_drl_bridge.identify.excitation import measure_coverage
+    from nics_drl_bridge.identify.fit import measure_coverage
     from nics_drl_bridge.robot.spec import load_robot
 
     out = Path(parameters["out"])
@@ -395,8 +395,7 @@ def names_of_sources(recordings: Sequence[Path]) -> list[str]:
 
 def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]:
     """Returns the conclusion, equations and errors of a fit."""
-    from nics_drl_bridge.identify.conclusion import conclude
-    from nics_drl_bridge.identify.report import format_equations
+    from nics_drl_bridge.identify.report import conclude, format_equations
 
     return {
         "model": str(out),

@@ -180,23 +180,15 @@ def _search(
     residual: Residual, centers: tuple[float, ...], lags: Array
 ) -> DelayEstimate:
     """Finds the delay on successively finer grids, then refines it together with the log lags."""
-    around = np.array(centers)
-    log_lags = np.log(lags)
-    for reach, step in zip((SEARCH_S, *STEPS_S[:-1]), STEPS_S, strict=True):
-        tries = np.add.outer(
-            around, np.arange(-reach, reach + step / 2.0, step)
-        ).ravel()
-        cost = [float((residual(np.append(d, log_lags)) ** 2).sum()) for d in tries]
-        around = tries[[int(np.argmin(cost))]]
-    start = np.append(around, log_lags)
+    delay, cost = _scan_delays(residual, centers, lags)
+    start = np.append(delay, np.log(lags))
     low, high = (
-        np.append(start[0] + reach, np.full(len(lags), limit))
-        for reach, limit in BOUNDS
+        np.append(delay + reach, np.full(len(lags), limit)) for reach, limit in BOUNDS
     )
     theta, jacobian, rest = minimise(
         residual, start, np.full(len(start), 0.1), (low, high)
     )
-    if float((rest**2).sum()) >= min(cost):
+    if float((rest**2).sum()) >= cost:
         theta = start
         rest = residual(start)
     sigma = estimate_uncertainty(jacobian, rest)
@@ -205,6 +197,20 @@ def _search(
     return DelayEstimate(
         float(theta[0]), float(sigma[0]), tau, sigma[1:] * tau, explained
     )
+
+
+def _scan_delays(
+    residual: Residual, centers: tuple[float, ...], lags: Array
+) -> tuple[float, float]:
+    """Returns the delay around the centers that leaves least at given lags, and what it leaves."""
+    around = np.array(centers)
+    log_lags = np.log(lags)
+    for reach, step in zip((SEARCH_S, *STEPS_S[:-1]), STEPS_S, strict=True):
+        offsets = np.arange(-reach, reach + step / 2.0, step)
+        trials = np.add.outer(around, offsets).ravel()
+        cost = [float((residual(np.append(d, log_lags)) ** 2).sum()) for d in trials]
+        around = trials[[int(np.argmin(cost))]]
+    return float(around[0]), min(cost)
 
 
 @dataclass(frozen=True)
@@ -404,22 +410,19 @@ def average_expected_states(
 
 
 def list_responses(
-    drive: Drive,
-    calibration: Calibration,
-    timing: TimingEstimate,
-    expected: Array | None,
+    drive: Drive, calibration: Calibration, timing: TimingEstimate
 ) -> tuple[Response, ...]:
-    """Returns the inferred states, with the speed scaled by that `expected` (n,) at gain 1."""
+    """Returns the inferred states; the gain of a speed is that of the motion."""
     spec = drive.spec
     if drive.recording.state is not None:
         return ()
     gains = np.ones(len(spec.state))
     speed = signals.find_speed_index(spec)
     moved = signals.select_moved_inputs(drive.recording.command, spec)
-    if speed is not None and expected is not None and moved[speed]:
-        gains[speed] = float(
-            expected @ compute_forward_speed(drive, calibration) / (expected @ expected)
-        )
+    if speed is not None and moved[speed]:
+        expected = average_expected_states(drive, drive.twists, timing)[:, speed]
+        driven = compute_forward_speed(drive, calibration)
+        gains[speed] = float(expected @ driven / (expected @ expected))
     return tuple(
         Response(v.name, str(v.follows), float(lag), float(gain))
         for v, lag, gain in zip(spec.state, timing.lags, gains, strict=True)

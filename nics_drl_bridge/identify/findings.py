@@ -3,9 +3,8 @@
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify import clocks, hypotheses, motion
-from nics_drl_bridge.identify.calibration import Calibration, align
+from nics_drl_bridge.identify import clocks, hypotheses
+from nics_drl_bridge.identify.calibration import Calibration, align, resample_motion
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import Fit, Regression
 from nics_drl_bridge.identify.mounting import Mounting
@@ -35,8 +34,6 @@ class Findings:
     timing: clocks.TimingEstimate
     # sentences from `repair_drive`
     repairs: tuple[str, ...] = ()
-    # (n,) over the training part's twists, at a gain of one, from `find_mounting`
-    expected_speed: Array | None = None
     # from `find_mounting`
     mounting: Mounting | None = None
     # from `estimate_timing`, `find_mounting`, `find_responses` and `measure_noise`; then from
@@ -125,4 +122,4 @@ def resample_drive(drive: Drive, findings: Findings) -> Samples:
     """Resamples a part of the drive on one time axis, by the calibration found so far."""
     if findings.motion_width_s is None:
         return align(drive, findings.calibration)
-    return motion.resample_motion(drive, findings.calibration, findings.motion_width_s)
+    return resample_motion(drive, findings.calibration, findings.motion_width_s)

@@ -12,9 +12,12 @@ import numpy as np
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
-from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.calibration import (
+    Calibration,
+    choose_half_width,
+    smooth_commands,
+)
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.motion import choose_half_width, smooth_commands
 from nics_drl_bridge.identify.open_loop import MIDDLE_OF_STEP, roll
 from nics_drl_bridge.identify.signals import (
     average_effect,
@@ -24,18 +27,19 @@ from nics_drl_bridge.identify.signals import (
     select_moved_commands,
     select_moved_inputs,
 )
+from nics_drl_bridge.identify.statistics import compute_unexplained
 from nics_drl_bridge.identify.terms import (
     Kind,
     Library,
     find_linear_term,
-    fit_motion_terms,
+    select_motion_terms,
     tells_lever_from_wheels,
 )
 from nics_drl_bridge.identify.yardstick import probe_structure
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
-from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.robot.taylor import TaylorModel, evaluate, list_exponents
 
 LAGS_S = (0.05, 0.15, 0.4, 1.0, 2.0)
 # trial dead zones, as fractions of the command's maximum
@@ -75,9 +79,11 @@ SHARES = (1.0, 0.5, 0.25)
 START_SPACING_S = 1.0
 LAG_RANGE_S = (0.002, 3.0)
 
+Row = tuple[float, float, float, float]  # start, scale, and bounds of a parameter
+
 
 @dataclass(frozen=True)
-class Candidate:
+class FoundCurve:
     """A curve that explains a component of the twist better than a straight line."""
 
     curve: InputCurve
@@ -85,7 +91,9 @@ class Candidate:
     drives: bool  # True if it is of the speed
 
 
-def find_input_curve(samples: Samples, spec: RobotSpec, place: int) -> Candidate | None:
+def find_input_curve(
+    samples: Samples, spec: RobotSpec, place: int
+) -> FoundCurve | None:
     """Returns the best curve of the command at an index; None if a straight line does as well."""
     structure = probe_structure(spec)
     # components of the twist that it drives
@@ -105,7 +113,7 @@ def find_input_curve(samples: Samples, spec: RobotSpec, place: int) -> Candidate
 
 def _fit_curve(
     samples: Samples, spec: RobotSpec, place: int, dof: int
-) -> Candidate | None:
+) -> FoundCurve | None:
     command = samples.x[:, len(spec.state) :]
     twist = {v.twist: samples.x[:, i] for i, v in enumerate(spec.state) if v.twist}
     speed = twist.get("vx", np.zeros(len(samples.t)))
@@ -140,7 +148,7 @@ def _fit_curve(
     if gain < WORTH:
         return None
     curve = _make_curve(spec.command[place].name, reach, dead, full)
-    return Candidate(curve, gain, dof == 0)
+    return FoundCurve(curve, gain, dof == 0)
 
 
 def _make_curve(name: str, reach: Array, dead: float, full: float) -> InputCurve:
@@ -172,62 +180,58 @@ class Form:
     mounted: tuple[str, ...] = ()
     is_timed: bool = False  # True if a measured state tells the latency
 
-    def latency_at(self, parameters: shooting.Parameters, values: Array) -> float:
-        """Returns the common latency of the commands for values (I,): their minimum delay [s]."""
-        at = dict(zip(parameters.names, values.tolist(), strict=True))
-        return float(
-            min((at[f"{name}.delay"] for name, _ in self.delays), default=at["latency"])
-        )
+    def find_latency(self, at: shooting.Values) -> float:
+        """Returns the common latency of the commands: their minimum delay [s]."""
+        delays = [at[f"{name}.delay"] for name, _ in self.delays]
+        return min(delays, default=at["latency"])
 
-    def curves_at(
-        self, parameters: shooting.Parameters, values: Array
-    ) -> tuple[InputCurve, ...]:
-        """Returns the input curves for values (I,)."""
-        at = dict(zip(parameters.names, values.tolist(), strict=True))
-        latency = self.latency_at(parameters, values)
-        curves = {c.command: c for c in self.curves}
+    def make_curves(self, at: shooting.Values) -> tuple[InputCurve, ...]:
+        """Returns the input curves for values of the parameters."""
+        latency = self.find_latency(at)
+        curves = {curve.command: curve for curve in self.curves}
         for name, _ in self.delays:
             curves.setdefault(name, InputCurve(command=name))
         curves_now = (
             InputCurve(
                 command=name,
-                dead=max(at.get(f"{name}.dead", c.dead), 0.0),
-                least=min(at.get(f"{name}.least", c.least), 0.0),
-                most=max(at.get(f"{name}.most", c.most), 0.0),
-                back=at.get(f"{name}.back", c.back),
+                dead=at.get(f"{name}.dead", curve.dead),
+                least=at.get(f"{name}.least", curve.least),
+                most=at.get(f"{name}.most", curve.most),
+                back=at.get(f"{name}.back", curve.back),
                 delay=at.get(f"{name}.delay", latency) - latency,
             )
-            for name, c in curves.items()
+            for name, curve in curves.items()
         )
         return tuple(c for c in curves_now if c != InputCurve(command=c.command))
 
-    def actuated(
-        self, model: TaylorModel, parameters: shooting.Parameters, values: Array
-    ) -> TaylorModel:
-        """Returns a model with lags, friction, drag and limits for values (I,)."""
-        at = dict(zip(parameters.names, values.tolist(), strict=True))
+    def actuate(self, model: TaylorModel, at: shooting.Values) -> TaylorModel:
+        """Returns a model with the lags, friction, drag and limits of its parameters."""
         states = model.variables[: model.state_size]
-        friction = [max(at.get(f"{name}.friction", 0.0), 0.0) for name in states]
-        drag = [max(at.get(f"{name}.drag", 0.0), 0.0) for name in states]
-        limits = [
-            [-at.get(f"{n}.fall", np.inf), at.get(f"{n}.rise", np.inf)] for n in states
-        ]
         commands = model.variables[model.state_size :]
-        emf = np.zeros((len(states), len(commands)))
-        for i, state in enumerate(states):
-            for j, command in enumerate(commands):
-                emf[i, j] = max(at.get(f"{state}.back_emf.{command}", 0.0), 0.0)
+        emf = [[at.get(f"{s}.back_emf.{c}", 0.0) for c in commands] for s in states]
+        falls = [-at.get(f"{name}.fall", np.inf) for name in states]
+        rises = [at.get(f"{name}.rise", np.inf) for name in states]
         model = replace(
             model,
-            friction=np.array(friction),
-            drag=np.array(drag),
-            back_emf=emf,
-            limits=np.array(limits).reshape(-1, 2),
+            friction=np.array([at.get(f"{name}.friction", 0.0) for name in states]),
+            drag=np.array([at.get(f"{name}.drag", 0.0) for name in states]),
+            back_emf=np.array(emf).reshape(len(states), len(commands)),
+            limits=np.stack([falls, rises], axis=1),
         )
         for state, command in self.followed:
             gain = at.get(f"{state}.gain", 1.0)
             model = set_lag(model, state, command, at[f"{state}.lag"], gain)
         return model
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A drive on one time axis, as calibrated so far, and the terms that its model may have."""
+
+    drive: Drive
+    calibration: Calibration
+    samples: Samples
+    library: Library
 
 
 def are_lags_measured(calibration: Calibration) -> bool:
@@ -244,16 +248,13 @@ def list_followed(drive: Drive) -> tuple[tuple[str, str], ...]:
     return tuple((v.name, str(v.follows)) for v, has_moved in pairs if has_moved)
 
 
-def list_delays(
-    drive: Drive, calibration: Calibration
-) -> tuple[tuple[str, float], ...]:
+def list_delays(evidence: Evidence) -> tuple[tuple[str, float], ...]:
     """Returns a delay [s] of each command that moved: at first, what all of them share."""
-    moved = select_moved_commands(drive.recording.command)
-    names = (c.name for c in drive.spec.command)
-    pairs = zip(names, moved.tolist(), strict=True)
-    return tuple(
-        (n, calibration.command_latency_s) for n, has_moved in pairs if has_moved
-    )
+    drive = evidence.drive
+    moved = select_moved_commands(drive.recording.command).tolist()
+    latency = evidence.calibration.command_latency_s
+    pairs = zip(drive.spec.command, moved, strict=True)
+    return tuple((c.name, latency) for c, has_moved in pairs if has_moved)
 
 
 def add_limits(form: Form, state: str) -> Form:
@@ -261,8 +262,10 @@ def add_limits(form: Form, state: str) -> Form:
     return replace(form, limits=(*form.limits, state))
 
 
-def make_form(drive: Drive, calibration: Calibration, library: Library) -> Form:
+def make_form(evidence: Evidence) -> Form:
     """Returns the plainest form of a drive's model."""
+    drive = evidence.drive
+    library = evidence.library
     spec = drive.spec
     if spec.moves_sideways and (spec.state or spec.takes_cmd_vel):
         # The terms of the twist may be those of a body that is turned or moved.
@@ -276,7 +279,7 @@ def make_form(drive: Drive, calibration: Calibration, library: Library) -> Form:
         return Form(mounted=("x", "heading"))
     if library.kind is Kind.MOTION:
         return Form()
-    known = calibration.uncertainty
+    known = evidence.calibration.uncertainty
     mounted = []
     if "lever_arm_x_m" in known:
         mounted.append("x")
@@ -292,33 +295,30 @@ def make_form(drive: Drive, calibration: Calibration, library: Library) -> Form:
 
 
 def choose_start(
-    problem: shooting.Shooting,
-    model: TaylorModel,
-    parameters: shooting.Parameters,
-    before: shooting.Parameters,
-) -> shooting.Parameters:
-    """Starts the limits of a state where predictions are best, together with its lag."""
-    names = list(parameters.names)
+    problem: shooting.Shooting, model: TaylorModel, known: tuple[str, ...]
+) -> shooting.Shooting:
+    """Starts limits of states that are not `known` where predictions are best, with the lags."""
+    names = list(problem.parameters.names)
     times = [k for k, name in enumerate(names) if name.endswith((".lag", ".delay"))]
     times.append(names.index("latency"))
-    coarse = replace(problem, spacing_s=START_SPACING_S)
     for name in names:
         state = name.removesuffix(".rise")
-        if state == name or name in before.names or f"{state}.lag" not in names:
+        if state == name or name in known or f"{state}.lag" not in names:
             continue
         places = [names.index(f"{state}.{word}") for word in ("rise", "fall")]
+        coarse = replace(problem, spacing_s=START_SPACING_S)
         trials = []
         for rate, share in product(RATES, SHARES):
-            start = parameters.start.copy()
+            start = problem.parameters.start.copy()
             start[places] *= rate
             start[times] *= share
-            start = np.clip(start, parameters.low, parameters.high)
-            error, _ = coarse.errors(model, start)
-            far = np.hypot(error[..., 0], error[..., 1])
-            trials.append((float(np.nanmean(far)), start))
+            start = np.clip(start, problem.parameters.low, problem.parameters.high)
+            trials.append((coarse.measure_mean_error(model, start), start))
         best = min(trials, key=lambda trial: trial[0])
-        parameters = replace(parameters, start=best[1])
-    return parameters
+        problem = replace(
+            problem, parameters=replace(problem.parameters, start=best[1])
+        )
+    return problem
 
 
 def set_lag(
@@ -336,13 +336,11 @@ def set_lag(
 
 
 def make_prediction_problem(
-    drive: Drive,
-    calibration: Calibration,
-    samples: Samples,
-    form: Form,
-    parameters: shooting.Parameters,
+    evidence: Evidence, form: Form, parameters: shooting.Parameters
 ) -> shooting.Shooting:
-    """Returns the prediction problem of a drive on one time axis."""
+    """Returns the prediction problem of a drive, to find the parameters of a form."""
+    drive = evidence.drive
+    samples = evidence.samples
     command = drive.recording.command
     spec = drive.spec
     dt = samples.dt
@@ -353,46 +351,36 @@ def make_prediction_problem(
         rows = np.round((t - t[0]) / dt).astype(np.intp) + lead
         t = t[0] + dt * (np.arange(-lead, rows[-1] - lead + 1) + MIDDLE_OF_STEP)
 
-    @lru_cache(maxsize=8)  # most values of a form do not affect the commands
+    @lru_cache(maxsize=8)  # most parameters do not affect the commands
     def average_commands(latency: float, curves: tuple[InputCurve, ...]) -> Array:
         return average_effect(command, spec, curves, t - latency, t - latency + dt)
 
-    def compute_all_commands(values: Array) -> Array:
-        latency = form.latency_at(parameters, values)
-        return average_commands(latency, form.curves_at(parameters, values))
-
-    def compute_commands(values: Array) -> Array:
-        return compute_all_commands(values)[rows]
+    def compute_all_commands(at: shooting.Values) -> Array:
+        return average_commands(form.find_latency(at), form.make_curves(at))
 
     @lru_cache(maxsize=8)  # nor do the coefficients affect such a state
-    def follow(values: tuple[float, ...]) -> Array:
-        sent = compute_all_commands(np.array(values))
-        at = dict(zip(parameters.names, values, strict=True))
+    def follow(items: tuple[tuple[str, float], ...]) -> Array:
+        at = dict(items)
+        sent = compute_all_commands(at)
         gains = [at.get(f"{v.name}.gain", 1.0) for v in spec.state]
         begin = np.array(gains) * sent[0, list_followed_commands(spec)]
-        model = form.actuated(_make_follower(spec, dt), parameters, np.array(values))
+        model = form.actuate(_make_follower(spec, dt), at)
         _, states = roll(model, begin[None], sent[None])
         return np.asarray(states[0][rows])
 
-    def infer_states(values: Array) -> Array:
-        return follow(tuple(values.tolist()))
-
-    def shape(model: TaylorModel, values: Array) -> TaylorModel:
-        return form.actuated(model, parameters, values)
-
     def trust(start: Array, end: Array) -> Array:
-        offset = calibration.clock_offset_s
+        offset = evidence.calibration.clock_offset_s
         return drive.trust(start - offset, end - offset)
 
     noise, _ = drive.pose_noise or (0.0, 0.0)
     return shooting.Shooting(
         samples,
-        compute_commands,
-        shape,
-        trust,
-        infer_states if form.followed else None,
-        bool(form.mounted),
-        noise,
+        parameters,
+        commands=lambda at: compute_all_commands(at)[rows],
+        shape=form.actuate,
+        trust=trust,
+        inferred=(lambda at: follow(tuple(at.items()))) if form.followed else None,
+        noise_m=noise,
     )
 
 
@@ -411,74 +399,86 @@ def _make_follower(spec: RobotSpec, dt: float) -> TaylorModel:
     )
 
 
-def list_parameters(
-    drive: Drive, calibration: Calibration, samples: Samples, form: Form
-) -> shooting.Parameters:
-    """Returns the values to be estimated besides coefficients: latency, and those of a form."""
-    rows = _list_command_values(drive, calibration.command_latency_s, form)
-    rows |= _list_follower_values(drive, calibration, form)
-    rates = {v.name: samples.dq[:, 3 + i] for i, v in enumerate(drive.spec.state)}
-    gains = {response.state: response.gain for response in calibration.responses}
+def list_parameters(evidence: Evidence, form: Form) -> shooting.Parameters:
+    """Returns the parameters of a form besides coefficients: start, scale and bounds by name."""
+    spec = evidence.drive.spec
+    samples = evidence.samples
+    rows = _list_command_values(evidence, form)
+    rows |= _list_follower_values(evidence, form)
+    rates = {v.name: samples.dq[:, 3 + i] for i, v in enumerate(spec.state)}
+    variables = dict(zip(spec.variable_names, samples.x.T, strict=True))
+    gains = {r.state: abs(r.gain) for r in evidence.calibration.responses}
     for state, command in form.followed:
-        sent = samples.x[:, drive.spec.variable_names.index(command)]
-        size = abs(gains[state]) * float(np.ptp(sent))
+        size = gains[state] * float(np.ptp(variables[command]))
         rates[state] = np.array([-size, size])
     for name in form.friction:
-        size = float(np.percentile(np.abs(rates[name]), STRONG))
-        rows[f"{name}.friction"] = (0.1 * size, 0.1 * size, 0.0, size)
+        rows[f"{name}.friction"] = _start_small(_find_strong(np.abs(rates[name])))
     for name in form.drag:
-        value = samples.x[:, drive.spec.variable_names.index(name)]
-        strong = float(np.percentile(np.abs(rates[name]), STRONG))
-        size = strong / max(float(np.mean(value**2)), 1e-3)
-        rows[f"{name}.drag"] = (0.1 * size, 0.1 * size, 0.0, size)
-        for place in list_driving_commands(drive.spec):
-            effect = np.abs(samples.x[:, len(drive.spec.state) + place] * value)
-            size = strong / max(float(effect.mean()), 1e-3)
-            key = f"{name}.back_emf.{drive.spec.command[place].name}"
-            rows[key] = (0.1 * size, 0.1 * size, 0.0, size)
+        rows |= _list_drag_values(name, rates[name], variables, spec)
     for name in form.limits:
         for word, rate in (("fall", -rates[name]), ("rise", rates[name])):
-            size = max(float(np.percentile(rate, STRONG)), 1e-3)
+            size = max(_find_strong(rate), 1e-3)
             rows[f"{name}.{word}"] = (size, 0.3 * size, 0.05 * size, 20.0 * size)
     if form.mounted:  # the remaining error of the mounting
-        reach = 2.0 * drive.spec.footprint_radius
-        for name, scale, most in (
-            ("x", LEVER_SCALE_M, reach),
-            ("y", LEVER_SCALE_M, reach),
-            ("heading", TURN_SCALE, np.pi),
-        ):
+        reach = 2.0 * spec.footprint_radius
+        mounting = {"x": (LEVER_SCALE_M, reach), "y": (LEVER_SCALE_M, reach)}
+        mounting["heading"] = (TURN_SCALE, np.pi)
+        for name, (scale, most) in mounting.items():
             most = most if name in form.mounted else 0.0
             rows[name] = (0.0, scale, -most, most)
     return shooting.Parameters(tuple(rows), *np.array(list(rows.values())).T)
 
 
-def _list_follower_values(
-    drive: Drive, calibration: Calibration, form: Form
-) -> dict[str, tuple[float, float, float, float]]:
-    """Returns start, scale and bounds of lags [s] and gains of states that follow commands."""
-    rows = {}
-    scaled = find_speed_index(drive.spec)
-    names = [v.name for v in drive.spec.state]
-    for response in calibration.responses:
-        if (response.state, response.command) not in form.followed:
-            continue
-        lag = float(np.clip(response.lag_s, *LAG_RANGE_S))
-        bounds = LAG_RANGE_S
-        if are_lags_measured(calibration) and not form.limits:
-            bounds = (lag, lag)
-        rows[f"{response.state}.lag"] = (lag, LAG_SCALE_S, *bounds)
-        if scaled is not None and names[scaled] == response.state:
-            size = abs(response.gain)
-            low, high = sorted((0.2 * response.gain, 5.0 * response.gain))
-            rows[f"{response.state}.gain"] = (response.gain, 0.1 * size, low, high)
+def _find_strong(rates: Array) -> float:
+    """Returns a strong rate of those of a drive (T,)."""
+    return float(np.percentile(rates, STRONG))
+
+
+def _list_drag_values(
+    name: str, rate: Array, variables: dict[str, Array], spec: RobotSpec
+) -> dict[str, Row]:
+    """Returns the rows of a state's drag, and of its back-EMF by each command that drives."""
+    value = variables[name]
+    strong = _find_strong(np.abs(rate))
+    square = max(float(np.mean(value**2)), 1e-3)
+    rows = {f"{name}.drag": _start_small(strong / square)}
+    for command in list_driving_commands(spec):
+        effect = max(float(np.abs(variables[command] * value).mean()), 1e-3)
+        rows[f"{name}.back_emf.{command}"] = _start_small(strong / effect)
     return rows
 
 
-def _list_command_values(
-    drive: Drive, latency: float, form: Form
-) -> dict[str, tuple[float, float, float, float]]:
-    """Returns start, scale and bounds of latency and delays [s], and of curves, by name."""
-    one_clock = drive.recording.pose.clock == drive.recording.command.clock
+def _start_small(size: float) -> Row:
+    """Returns start, scale and bounds of a parameter between zero and a size."""
+    return 0.1 * size, 0.1 * size, 0.0, size
+
+
+def _list_follower_values(evidence: Evidence, form: Form) -> dict[str, Row]:
+    """Returns the rows of lags [s] and gains of states that follow commands."""
+    spec = evidence.drive.spec
+    rows = {}
+    scaled = find_speed_index(spec)
+    names = [v.name for v in spec.state]
+    for response in evidence.calibration.responses:
+        state = response.state
+        if (state, response.command) not in form.followed:
+            continue
+        lag = float(np.clip(response.lag_s, *LAG_RANGE_S))
+        is_known = are_lags_measured(evidence.calibration) and not form.limits
+        bounds = (lag, lag) if is_known else LAG_RANGE_S
+        rows[f"{state}.lag"] = (lag, LAG_SCALE_S, *bounds)
+        if scaled is not None and names[scaled] == state:
+            size = abs(response.gain)
+            low, high = sorted((0.2 * response.gain, 5.0 * response.gain))
+            rows[f"{state}.gain"] = (response.gain, 0.1 * size, low, high)
+    return rows
+
+
+def _list_command_values(evidence: Evidence, form: Form) -> dict[str, Row]:
+    """Returns the rows of latency and delays [s], and of input curves."""
+    recording = evidence.drive.recording
+    latency = evidence.calibration.command_latency_s
+    one_clock = recording.pose.clock == recording.command.clock
     bounds = (
         min(latency, 0.0) if one_clock else latency - LONGEST_S,
         latency + LONGEST_S,
@@ -503,14 +503,12 @@ def _list_command_values(
     return rows
 
 
-def find_two_way_curves(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
+def find_two_way_curves(evidence: Evidence) -> tuple[InputCurve, ...]:
     """Returns neutral curves of commands that drive the robot both ways."""
-    spec = drive.spec
-    command = samples.x[:, len(spec.state) :]
+    spec = evidence.drive.spec
     curves = []
-    for place in list_driving_commands(spec):
-        name = spec.command[place].name
-        sent = command[:, place]
+    for name in list_driving_commands(spec):
+        sent = evidence.samples.x[:, spec.variable_names.index(name)]
         if min((sent < 0.0).mean(), (sent > 0.0).mean()) > TWO_WAY:
             least = float(sent.min())
             most = float(sent.max())
@@ -518,31 +516,27 @@ def find_two_way_curves(drive: Drive, samples: Samples) -> tuple[InputCurve, ...
     return tuple(curves)
 
 
-def list_driving_commands(spec: RobotSpec) -> tuple[int, ...]:
-    """Returns the indices of the commands that drive a robot ahead, according to its textbook."""
+def list_driving_commands(spec: RobotSpec) -> tuple[str, ...]:
+    """Names the commands that drive a robot ahead, according to its textbook."""
     structure = probe_structure(spec)
     if structure is None:
         return ()
     moves, _ = structure
-    return tuple(np.flatnonzero(moves[0]).tolist())
+    return tuple(spec.command[k].name for k in np.flatnonzero(moves[0]))
 
 
 def add_dead_zones(
-    form: Form,
-    drive: Drive,
-    samples: Samples,
-    commands: tuple[str, ...] | None = None,
+    form: Form, evidence: Evidence, commands: tuple[str, ...] | None = None
 ) -> Form:
     """Returns a form in which commands, by default those that drive ahead, have a dead zone."""
-    names = [command.name for command in drive.spec.command]
+    spec = evidence.drive.spec
     if commands is None:
-        commands = tuple(names[place] for place in list_driving_commands(drive.spec))
+        commands = list_driving_commands(spec)
     bent = {c.command: c for c in form.curves}
     for name in commands:
-        place = names.index(name)
-        reach = samples.x[:, len(drive.spec.state) + place]
-        low = min(float(reach.min()), 0.0)
-        high = max(float(reach.max()), 0.0)
+        sent = evidence.samples.x[:, spec.variable_names.index(name)]
+        low = min(float(sent.min()), 0.0)
+        high = max(float(sent.max()), 0.0)
         curve = bent.get(name, InputCurve(command=name, least=low, most=high))
         if not curve.dead:
             bent[name] = curve.model_copy(update={"dead": SMALL_DEAD * max(-low, high)})
@@ -565,30 +559,40 @@ def drop_unreached_ends(
     Limits below their errors (by name) are removed as well. The range of a command in effect
     becomes that of the commands sent.
     """
-    names = [c.name for c in drive.spec.command]
-    sent = drive.recording.command.values
     low = model.low.copy()
     high = model.high.copy()
     curves = []
-    limits = model.limits.copy()
     for curve in model.inputs:
-        place = names.index(curve.command)
-        least = float(sent[:, place].min())
-        most = float(sent[:, place].max())
-        beyond = NEAR_END * max(-least, most)
-        ends = {}
-        if not least < curve.least - beyond:
-            ends["least"] = -np.inf
-        if not most > curve.most + beyond:
-            ends["most"] = np.inf
-        curve = curve.model_copy(update=ends)
+        place = [c.name for c in drive.spec.command].index(curve.command)
+        sent = drive.recording.command.values[:, place]
+        reach = np.array([min(sent.min(), 0.0), max(sent.max(), 0.0)])
+        curve = _drop_curve_ends(curve, reach)
         row = model.state_size + place
-        low[row], high[row] = curve.of([least, most])
+        low[row], high[row] = curve.of([sent.min(), sent.max()])
         if curve != InputCurve(command=curve.command):
             curves.append(curve)
-    free = replace(
-        model, limits=np.zeros((0, 2)), drag=np.zeros(0), friction=np.zeros(0)
-    )
+    limits = _drop_limits(model, samples, errors)
+    return replace(model, inputs=tuple(curves), low=low, high=high, limits=limits)
+
+
+def _drop_curve_ends(curve: InputCurve, reach: Array) -> InputCurve:
+    """Returns a curve without the ends that a command within its reach (2,) did not pass."""
+    beyond = NEAR_END * float(np.abs(reach).max())
+    ends = {}
+    if not reach[0] < curve.least - beyond:
+        ends["least"] = -np.inf
+    if not reach[1] > curve.most + beyond:
+        ends["most"] = np.inf
+    return curve.model_copy(update=ends)
+
+
+def _drop_limits(
+    model: TaylorModel, samples: Samples, errors: Mapping[str, float]
+) -> Array:
+    """Returns the limits (S, 2) of a model, infinite where the drive hardly reached them."""
+    limits = model.limits.copy()
+    nothing = np.zeros(0)
+    free = replace(model, limits=np.zeros((0, 2)), drag=nothing, friction=nothing)
     asked = free.rates(samples.x)[:, 3:]
     for i, name in enumerate(model.variables[: model.state_size]):
         lowest, highest = np.percentile(asked[:, i], (SELDOM, 100.0 - SELDOM))
@@ -596,23 +600,28 @@ def drop_unreached_ends(
             limits[i, 0] = -np.inf
         if not highest > limits[i, 1] > errors.get(f"{name}.rise", 0.0):
             limits[i, 1] = np.inf
-    return replace(model, inputs=tuple(curves), low=low, high=high, limits=limits)
+    return limits
 
 
 def find_likely_delay(
     drive: Drive, calibration: Calibration, samples: Samples
 ) -> float:
     """Returns the delay [s] of the commands that best explains the rates of the state."""
-    form = Form(calibration.inputs)
-    parameters = list_parameters(drive, calibration, samples, form)
-    problem = make_prediction_problem(drive, calibration, samples, form, parameters)
+    recording = drive.recording
     trials = np.arange(0.0, LONGEST_S, DELAY_STEP_S)
-    if drive.recording.pose.clock != drive.recording.command.clock:
+    if recording.pose.clock != recording.command.clock:
         trials = trials - LONGEST_S / 2.0
     width = choose_half_width(drive)
     left = []
     for delay in trials:
-        command = problem.commands(np.append(delay, parameters.start[1:]))
+        begin = samples.t - delay
+        command = average_effect(
+            recording.command,
+            drive.spec,
+            calibration.inputs,
+            begin,
+            begin + samples.dt,
+        )
         smooth = smooth_commands(command, samples.dt, width)
         left.append(_measure_unexplained(drive.spec, samples, smooth))
     if np.isfinite(left).all():
@@ -624,9 +633,14 @@ def _measure_unexplained(spec: RobotSpec, samples: Samples, command: Array) -> f
     """Returns the part of the state's rates that commands in effect (T, C) leave unexplained."""
     states = len(spec.state)
     free = [3 + i for i, v in enumerate(spec.state) if v.twist] or [0, 2]
-    x = np.concatenate([samples.x[:, :states], command], axis=1)
     # rows in between hardly differ
-    stride = max(1, min(round(STRIDE_S / samples.dt), len(x) // ENOUGH_ROWS))
-    kept = np.arange(len(x)) % stride == 0
-    fit = fit_motion_terms(replace(samples, x=x).rows(kept), spec, DELAY_ORDER)
-    return float((1.0 - fit.r2[free]).sum())
+    stride = max(1, min(round(STRIDE_S / samples.dt), len(command) // ENOUGH_ROWS))
+    x = np.concatenate([samples.x[:, :states], command], axis=1)[::stride]
+    rates = samples.dq[::stride]
+    powers = list_exponents(x.shape[1], DELAY_ORDER)
+    allowed = select_motion_terms(powers, spec)
+    left = 0.0
+    for d in free:
+        chi = evaluate(x, powers[allowed[d]])
+        left += float((compute_unexplained(chi, rates[:, [d]]) ** 2).mean())
+    return left

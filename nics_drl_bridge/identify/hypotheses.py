@@ -1,9 +1,11 @@
 """Hypotheses on a drive: the textbook as a base, effects beside it, and orders of terms beyond."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +14,9 @@ from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import forms, shooting, terms
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.excitation import list_unmoved_variables
-from nics_drl_bridge.identify.fit import Alpha, Order, prune
+from nics_drl_bridge.identify.fit import Alpha, Order, list_unmoved_variables, prune
 from nics_drl_bridge.identify.open_loop import HORIZON_S
-from nics_drl_bridge.identify.statistics import CERTAIN, estimate_clustered_errors
+from nics_drl_bridge.identify.statistics import CERTAIN
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.curve import InputCurve
@@ -39,6 +39,9 @@ NOTHING = 1e-4  # m, rad: size below which a removed part of a mounting counts a
 # A model uses the values at the start of a step, so a time is uncertain by the standard deviation
 # of a uniform distribution over the step.
 WITHIN_STEP = 12.0**-0.5
+MOUNTING = ("x", "y", "heading")  # parameters of the tracked body's pose
+# ratio of the error of a pull to that of a stronger one, from which no weaker one is tried
+HOPELESS = 1.02
 LONGEST_LAG_S = 2.0  # a state that takes longer is coasting, so it hides no latency
 BANDS_S = (0.5, 1.0, 2.0, HORIZON_S)
 UNSEEN = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
@@ -46,6 +49,8 @@ UNSEEN = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
 # (order, 0 for the textbook's terms alone; pull towards these)
 Hypothesis = tuple[int, float]
 TEXTBOOK = 0, 0.0
+# name of a change, the change, and the fraction to which it must cut the error
+Change = tuple[str, Callable[[forms.Form], forms.Form], float]
 
 
 @dataclass(frozen=True)
@@ -72,24 +77,17 @@ class Draft:
 
     library: terms.Library
     form: forms.Form
-    parameters: shooting.Parameters
     problem: shooting.Shooting
-
-    @property
-    def spec(self) -> RobotSpec:
-        """The robot."""
-        return self.library.spec
 
     def select(self, inside: terms.Mask | None) -> Samples:
         """Returns the samples inside (T,), with the states that follow the commands."""
-        samples = self.problem.resample(self.parameters.start)
+        samples = self.problem.resample(self.problem.parameters.start)
         return samples if inside is None else samples.rows(inside)
 
     def fit_base(
         self, inside: terms.Mask | None = None, other: TaylorModel | None = None
     ) -> shooting.Predictive:
         """Fits the base's terms, gains and lags; the search may start at another model."""
-        spec = self.spec
         model = self.library.fit_base(self.select(inside), self.form.tyres)
         if self.form.followed:
             model = terms.add_linear_terms(model)
@@ -100,12 +98,11 @@ class Draft:
             self.problem,
             model,
             self.library.select_free(model),
-            self.parameters,
             inside,
             BASE_EVALUATIONS,
             first=first,
         )
-        return replace(fitted, model=terms.stabilise(fitted.model, spec))
+        return replace(fitted, model=terms.stabilise(fitted.model, self.library.spec))
 
     def refine(
         self,
@@ -119,24 +116,17 @@ class Draft:
         if self.library.kind is terms.Kind.MEASURED:
             base = linear  # rates of a measured state are fitted to that state itself
         base, first = terms.merge_terms(base, linear)
-        both = replace(
-            base, coefficients=np.where(first != 0.0, first, base.coefficients)
-        )
-        free = self.library.select_free(both)
+        both = np.where(first != 0.0, first, base.coefficients)
+        free = self.library.select_free(replace(base, coefficients=both))
         return shooting.fit_to_predictions(
-            self.problem, base, free, self.parameters, inside, evaluations, pull, first
+            self.problem, base, free, inside, evaluations, pull, first
         )
-
-    def measure_error(self, predictive: shooting.Predictive) -> float:
-        """Returns the mean distance of predicted from measured ends, over all horizons [m]."""
-        error = self.problem.errors(predictive.model, predictive.values)[0]
-        return float(np.nanmean(np.hypot(error[..., 0], error[..., 1])))
 
     def calibrate(
         self, found: shooting.Predictive, calibration: Calibration
     ) -> Calibration:
         """Returns a calibration with delays, input curves, lags and mounting of a search."""
-        at = dict(zip(self.parameters.names, found.values.tolist(), strict=True))
+        at = found.named
         responses = (
             replace(
                 response,
@@ -145,59 +135,56 @@ class Draft:
             )
             for response in calibration.responses
         )
-        latency = self.form.latency_at(self.parameters, found.values)
-        known = calibration.uncertainty | found.named_errors(self.parameters.names)
-        within_step = WITHIN_STEP * self.problem.samples.dt
-        for name, _ in self.form.delays:
-            key = f"{name}.delay"
-            if key in known:
-                known[key] = float(np.hypot(known[key], within_step))
-        time_error = self._estimate_time_error(found)
-        offset = calibration.clock_offset_s
-        is_told = not np.isnan(time_error)
-        # A delay between two clocks is a part of their offset, unless that dates a derived state.
-        if "clock_offset_s" in known and self.problem.inferred is not None:
-            offset -= latency - calibration.command_latency_s
-            latency = calibration.command_latency_s
-            beside = known.get("command_latency_s", 0.0)
-            if is_told:
-                known["clock_offset_s"] = float(np.hypot(time_error, beside))
-        elif is_told:
-            known["command_latency_s"] = time_error
         calibration = replace(
             calibration,
-            clock_offset_s=offset,
-            command_latency_s=latency,
-            inputs=self.form.curves_at(self.parameters, found.values),
+            inputs=self.form.make_curves(at),
             responses=tuple(responses),
-            uncertainty=known,
+            uncertainty=calibration.uncertainty | self._widen_errors(found),
         )
-        if self.problem.mounted:
+        calibration = self._calibrate_time(found, calibration)
+        if self.problem.is_mounted:
             return add_predicted_mounting(calibration, found)
         return calibration
 
-    def _estimate_time_error(self, found: shooting.Predictive) -> float:
-        """Returns the standard error of the latency [s], which the model's step widens."""
-        names = list(self.parameters.names)
-        name = "latency"
-        if self.form.delays:
-            at = dict(zip(names, found.values.tolist(), strict=True))
-            name = min(
-                (f"{key}.delay" for key, _ in self.form.delays), key=at.__getitem__
-            )
-        error = float(found.value_errors[names.index(name)])
-        return float(np.hypot(error, WITHIN_STEP * self.problem.samples.dt))
+    def _widen_errors(self, found: shooting.Predictive) -> dict[str, float]:
+        """Returns the errors of the parameters of commands and states; a step widens delays."""
+        within_step = WITHIN_STEP * self.problem.samples.dt
+        return {
+            name: float(np.hypot(e, within_step)) if name.endswith(".delay") else e
+            for name, e in found.shown_errors.items()
+        }
+
+    def _calibrate_time(
+        self, found: shooting.Predictive, calibration: Calibration
+    ) -> Calibration:
+        """Returns a calibration with the clock offset and the latency of a search."""
+        at = found.named
+        latency = self.form.find_latency(at)
+        delays = (f"{command}.delay" for command, _ in self.form.delays)
+        quickest = min(delays, key=at.__getitem__, default="latency")
+        within_step = WITHIN_STEP * self.problem.samples.dt
+        error = float(np.hypot(found.errors[quickest], within_step))
+        known = dict(calibration.uncertainty)
+        # A delay between two clocks is a part of their offset, unless that dates a derived state.
+        if "clock_offset_s" in known and self.problem.inferred is not None:
+            if not np.isnan(error):
+                beside = known.get("command_latency_s", 0.0)
+                known["clock_offset_s"] = float(np.hypot(error, beside))
+            late = latency - calibration.command_latency_s
+            offset = calibration.clock_offset_s - late
+            return replace(calibration, clock_offset_s=offset, uncertainty=known)
+        if not np.isnan(error):
+            known["command_latency_s"] = error
+        return replace(calibration, command_latency_s=latency, uncertainty=known)
 
     def add_errors(
         self, found: shooting.Predictive, linear: TaylorModel
     ) -> TaylorModel:
         """Returns a found model with standard errors; those of other terms are a linear fit's."""
         model = found.model
-        errors = estimate_coefficient_errors(found)
-        at = dict(zip(self.parameters.names, found.values.tolist(), strict=True))
-        sigma = dict(
-            zip(self.parameters.names, found.value_errors.tolist(), strict=True)
-        )
+        errors = found.coefficient_errors.copy()
+        at = found.named
+        sigma = found.errors
         for state, command in self.form.followed:
             row = terms.FIRST_STATE + model.variables.index(state)
             own = terms.find_linear_term(model, state)
@@ -208,8 +195,7 @@ class Draft:
             errors[row, own] = rate * relative
             errors[row, driven] = np.hypot(gained * relative, by_gain)
         named = {dof: dict(by_term) for dof, by_term in linear.named_errors.items()}
-        refined = replace(model, std_errors=errors).named_errors
-        for dof, by_term in refined.items():
+        for dof, by_term in replace(model, std_errors=errors).named_errors.items():
             named.setdefault(dof, {}).update(by_term)
         return model.add_errors(named)
 
@@ -226,65 +212,82 @@ class Draft:
         if (coefficients == model.coefficients).all():
             return found
         pruned = replace(model, coefficients=coefficients)
+        parameters = replace(self.problem.parameters, start=found.values)
+        problem = replace(self.problem, parameters=parameters)
         free = self.library.select_free(pruned)
-        parameters = replace(self.parameters, start=found.values)
-        return shooting.fit_to_predictions(self.problem, pruned, free, parameters)
+        return shooting.fit_to_predictions(problem, pruned, free)
 
     def cross_validate(self, asked: tuple[Hypothesis, ...]) -> tuple[Trial, ...]:
-        """Cross-validates each hypothesis over `FOLDS` parts of a drive.
+        """Cross-validates hypotheses over `FOLDS` parts of a drive.
+
+        A weaker pull is not tried for an order whose error grew by a factor of `HOPELESS` already
+        from the pull before.
+        """
+        parameters = self.problem.parameters.freeze()
+        problem = replace(self.problem, spacing_s=SPACING_S, parameters=parameters)
+        draft = replace(self, problem=problem)
+        folds = list(draft.list_folds({order for order, pull in asked if pull}))
+        trials: list[Trial] = []
+        hopeless = set()
+        for order, pull in asked:
+            if order in hopeless:
+                continue
+            trial = draft.try_hypothesis(order, pull, folds)
+            before = [other for other in trials if other.order == order]
+            if before and trial.error > HOPELESS * before[-1].error:
+                hopeless.add(order)
+            trials.append(trial)
+        return tuple(trials)
+
+    def list_folds(self, orders: Collection[int]) -> Iterator["Fold"]:
+        """Yields the parts of a drive to leave out.
 
         A part is not left out if a variable would not have moved without it, or if the rest is too
         short to fit a model.
         """
         samples = self.problem.samples
-        values = self.parameters.start
+        spec = self.library.spec
         everything = np.arange(len(samples.t))
-        unmoved = list_unmoved_variables(samples, self.spec)
-        problem = replace(self.problem, spacing_s=SPACING_S, fixed=values)
-        fixed = replace(self, problem=problem, parameters=shooting.NO_PARAMETERS)
-        nothing = np.zeros((0, len(BANDS_S)))
-        distances = dict.fromkeys(asked, nothing)  # (W, H) of ends
-        paths = nothing  # (W, H)
-        judge = replace(problem, horizons=BANDS_S)
+        unmoved = list_unmoved_variables(samples, spec)
         for block in np.array_split(everything, FOLDS):
             unseen = np.isin(everything, block)
-            if list_unmoved_variables(samples.rows(~unseen), self.spec) != unmoved:
+            if list_unmoved_variables(samples.rows(~unseen), spec) != unmoved:
                 continue
-            try:
-                models = list(fixed.fit_models(asked, ~unseen))
-            except FitError:
-                continue
-            for hypothesis, model in models:
-                error, path = judge.errors(model, values, unseen)
-                far = np.hypot(error[..., 0], error[..., 1])
-                distances[hypothesis] = np.concatenate([distances[hypothesis], far])
-            paths = np.concatenate([paths, path])
-        longest = paths[:, -1]
-        length = float(longest[~np.isnan(longest)].sum())
-        trials = []
-        for (order, pull), far in distances.items():
-            share = float(np.nansum(far[:, -1])) / length if length else np.nan
-            columns = zip(BANDS_S, far.T, strict=True)
-            errors = {h: column[~np.isnan(column)] for h, column in columns}
-            trials.append(Trial(order, pull, share, errors))
-        return tuple(trials)
+            with suppress(FitError):
+                base = self.fit_base(~unseen).model
+                inside = self.select(~unseen)
+                starts = {k: self.library.fit(inside, k).model for k in orders}
+                yield Fold(unseen, base, starts)
 
-    def fit_models(
-        self, asked: tuple[Hypothesis, ...], inside: terms.Mask
-    ) -> Iterator[tuple[Hypothesis, TaylorModel]]:
-        """Yields the model of each hypothesis, fitted to the rows inside (T,)."""
-        samples = self.select(inside)
-        base = self.fit_base(inside).model
-        starts: dict[int, TaylorModel] = {}  # of the searches, by order
-        for order, pull in asked:
-            if not pull:
-                yield (order, pull), base
-                continue
-            if order not in starts:
-                starts[order] = self.library.fit(samples, order).model
-            refined = self.refine(base, starts[order], inside, EVALUATIONS, pull)
-            starts[order] = refined.model  # near the best model of the next pull
-            yield (order, pull), refined.model
+    def try_hypothesis(self, order: int, pull: float, folds: list["Fold"]) -> Trial:
+        """Predicts the parts that were left out of the fits of a hypothesis."""
+        judge = replace(self.problem, horizons=BANDS_S)
+        distances = [np.zeros((0, len(BANDS_S)))]  # (W, H) of ends
+        paths = [np.zeros((0, len(BANDS_S)))]  # (W, H)
+        for fold in folds:
+            model = fold.base
+            if pull:
+                start = fold.starts[order]
+                model = self.refine(model, start, ~fold.unseen, EVALUATIONS, pull).model
+                fold.starts[order] = model  # near the best model of the next pull
+            error, path = judge.errors(model, judge.parameters.start, fold.unseen)
+            distances.append(np.hypot(error[..., 0], error[..., 1]))
+            paths.append(path)
+        far = np.concatenate(distances)
+        length = float(np.nansum(np.concatenate(paths)[:, -1]))
+        share = float(np.nansum(far[:, -1])) / length if length else np.nan
+        columns = zip(BANDS_S, far.T, strict=True)
+        errors = {horizon: column[~np.isnan(column)] for horizon, column in columns}
+        return Trial(order, pull, share, errors)
+
+
+@dataclass(frozen=True)
+class Fold:
+    """A part of a drive that is left out of fits, and what these start from."""
+
+    unseen: terms.Mask  # (T,) rows of the part
+    base: TaylorModel  # fitted to the other rows
+    starts: dict[int, TaylorModel]  # latest fits to the other rows, by order
 
 
 @dataclass(frozen=True)
@@ -306,25 +309,19 @@ class Base:
     candidates: tuple[Candidate, ...] = ()  # forms that were tried, in this order
 
 
-def fit_base(
-    drive: Drive,
-    calibration: Calibration,
-    samples: Samples,
-    library: terms.Library,
-    clear: tuple[InputCurve, ...],
-) -> Base:
+def fit_base(evidence: forms.Evidence, clear: tuple[InputCurve, ...]) -> Base:
     """Fits the textbook with and without each part of a form; keeps what improves predictions.
 
     `clear` curves are always kept.
     """
-    problem = BaseProblem(drive, calibration, samples, library)
-    plain_form = forms.make_form(drive, calibration, library)
-    best = problem.fit(replace(plain_form, curves=calibration.inputs))
+    plain_form = forms.make_form(evidence)
+    inputs = evidence.calibration.inputs
+    best = fit_form(evidence, replace(plain_form, curves=inputs))
     trial = cross_validate_base(best)
-    start = "textbook with input curves" if calibration.inputs else "textbook"
+    start = "textbook with input curves" if inputs else "textbook"
     candidates = [Candidate(start, trial.error, kept=True)]
-    if len(calibration.inputs) > len(clear):
-        plain = problem.fit(replace(plain_form, curves=clear))
+    if len(inputs) > len(clear):
+        plain = fit_form(evidence, replace(plain_form, curves=clear))
         plain_trial = cross_validate_base(plain)
         # an infinite level: too short to judge
         is_better = plain_trial.level < trial.level or np.isinf(plain_trial.level)
@@ -336,15 +333,14 @@ def fit_base(
             best = plain
             trial = plain_trial
     # Each change builds on those that were kept before it, so their order matters.
-    for name, change, worth in list_changes(drive, calibration, samples, library):
+    for name, change, worth in list_changes(evidence):
         form = change(best.draft.form)
         if form == best.draft.form:
             continue
-        changed = problem.fit(form, best)
+        changed = fit_form(evidence, form, best)
         changed_trial = cross_validate_base(changed)
-        is_better = changed_trial.level < worth * trial.level and _is_certain(
-            changed, best
-        )
+        is_better = changed_trial.level < worth * trial.level
+        is_better &= _is_certain(changed.found, best.found)
         candidates.append(Candidate(name, changed_trial.error, kept=is_better))
         if is_better:
             best = changed
@@ -352,48 +348,32 @@ def fit_base(
     return replace(best, candidates=tuple(candidates))
 
 
-def refit_base(
-    drive: Drive,
-    calibration: Calibration,
-    samples: Samples,
-    library: terms.Library,
-    former: Base,
-) -> Base:
+def refit_base(evidence: forms.Evidence, former: Base) -> Base:
     """Fits a base of the same form to other data."""
-    followed = forms.make_form(drive, calibration, library).followed
-    form = replace(former.draft.form, curves=calibration.inputs, followed=followed)
-    problem = BaseProblem(drive, calibration, samples, library)
-    refitted = problem.fit(form, former if form.followed else None)
+    followed = forms.make_form(evidence).followed
+    inputs = evidence.calibration.inputs
+    form = replace(former.draft.form, curves=inputs, followed=followed)
+    refitted = fit_form(evidence, form, former if followed else None)
     return replace(refitted, candidates=former.candidates)
 
 
-@dataclass(frozen=True)
-class BaseProblem:
-    """What a base is fitted to."""
-
-    drive: Drive
-    calibration: Calibration
-    samples: Samples
-    library: terms.Library
-
-    def fit(self, form: forms.Form, start: Base | None = None) -> Base:
-        """Fits the textbook with a form; the search may start at another base."""
-        data = (self.drive, self.calibration, self.samples, form)
-        parameters = forms.list_parameters(*data)
-        if start is not None:
-            parameters = parameters.start_from(start.draft.parameters)
-        problem = forms.make_prediction_problem(*data, parameters)
-        model = None
-        if start is not None:
-            model = start.found.model
-            parameters = forms.choose_start(
-                problem, model, parameters, start.draft.parameters
-            )
-        coarse = replace(problem, spacing_s=SPACING_S)
-        draft = Draft(self.library, form, parameters, coarse)
-        predictive = draft.fit_base(other=model)
-        parameters = replace(parameters, start=predictive.values)
-        return Base(replace(draft, parameters=parameters, problem=problem), predictive)
+def fit_form(
+    evidence: forms.Evidence, form: forms.Form, start: Base | None = None
+) -> Base:
+    """Fits the textbook with a form; the search may start at another base."""
+    parameters = forms.list_parameters(evidence, form)
+    if start is not None:
+        parameters = parameters.start_from(start.draft.problem.parameters)
+    problem = forms.make_prediction_problem(evidence, form, parameters)
+    model = None
+    if start is not None:
+        model = start.found.model
+        problem = forms.choose_start(problem, model, start.found.names)
+    coarse = replace(problem, spacing_s=SPACING_S)
+    found = Draft(evidence.library, form, coarse).fit_base(other=model)
+    parameters = replace(problem.parameters, start=found.values)
+    problem = replace(problem, parameters=parameters)
+    return Base(Draft(evidence.library, form, problem), found)
 
 
 def cross_validate_base(base: Base) -> Trial:
@@ -401,88 +381,72 @@ def cross_validate_base(base: Base) -> Trial:
     return base.draft.cross_validate((TEXTBOOK,))[0]
 
 
-def list_changes(
-    drive: Drive, calibration: Calibration, samples: Samples, library: terms.Library
-) -> Iterator[tuple[str, Callable[[forms.Form], forms.Form], float]]:
-    """Yields changes to the form of a motion by name, and the fraction to cut the error to."""
-    if library.kind is not terms.Kind.MOTION:
-        yield from _list_follower_changes(drive, calibration, samples)
+def list_changes(evidence: forms.Evidence) -> Iterator[Change]:
+    """Yields changes to the form of a model in the order in which they are tried."""
+    if evidence.library.kind is not terms.Kind.MOTION:
+        yield from _list_follower_changes(evidence)
         return
+    spec = evidence.drive.spec
     # Drag and friction are hard to distinguish, so both are tried, then each without the other.
-    speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
-    shared = forms.list_delays(drive, calibration)
-    delays = "a delay of each command"
+    speeds = tuple(v.name for v in spec.state if v.twist == "vx")
+    delays = _list_delay_changes(forms.list_delays(evidence))
     # First, because a wrong delay hides other effects and is hidden by them.
-    if len(shared) > 1:
-        yield delays, lambda form: replace(form, delays=shared), WORTH
-    if terms.has_slipping_tyres(drive.spec):
-        yield "tyres that slip", lambda form: replace(form, tyres=True), WORTH
+    yield from delays
+    if terms.has_slipping_tyres(spec):
+        yield "tyres that slip", _change(tyres=True), WORTH
     if speeds:
         drag = "drag and back-EMF"
         friction = "dry friction"
-        both = f"{drag}, and {friction}"
-        yield both, lambda form: replace(form, drag=speeds, friction=speeds), WORTH
-        without = f"without {drag}"
-        yield without, lambda form: replace(form, drag=()), 1.0 / WORTH
-        without = f"without {friction}"
-        yield without, lambda form: replace(form, friction=()), 1.0 / WORTH
-    if len(shared) > 1:
-        yield delays, lambda form: replace(form, delays=shared), WORTH
+        yield f"{drag}, and {friction}", _change(drag=speeds, friction=speeds), WORTH
+        yield f"without {drag}", _change(drag=()), 1.0 / WORTH
+        yield f"without {friction}", _change(friction=()), 1.0 / WORTH
+    yield from delays
     if speeds:
-        yield (
-            "a dead zone",
-            lambda form: forms.add_dead_zones(form, drive, samples),
-            WORTH,
-        )
-        limits = "limits of acceleration"
-        yield limits, lambda form: replace(form, limits=speeds), WORTH
-        others = tuple(
-            v.name for v in drive.spec.state if v.twist and not drive.spec.steers
-        )
+        bent = partial(forms.add_dead_zones, evidence=evidence)
+        yield "a dead zone", bent, WORTH
+        yield "limits of acceleration", _change(limits=speeds), WORTH
+        others = tuple(v.name for v in spec.state if v.twist and not spec.steers)
         if others:
-            all_limits = f"limits of {', '.join(others)}"
-            yield all_limits, lambda form: replace(form, limits=others), WORTH
-        backwards = forms.find_two_way_curves(drive, samples)
+            yield f"limits of {', '.join(others)}", _change(limits=others), WORTH
+        backwards = forms.find_two_way_curves(evidence)
         if backwards:
-            gain = "a gain of its own backwards"
-            yield gain, lambda form: forms.add_reverse_gains(form, backwards), WORTH
+            reverse = partial(forms.add_reverse_gains, curves=backwards)
+            yield "a gain of its own backwards", reverse, WORTH
 
 
-def _is_certain(changed: Base, before: Base) -> bool:
+def _change(**parts: Any) -> Callable[[forms.Form], forms.Form]:
+    """Returns a change that sets parts of a form."""
+    return lambda form: replace(form, **parts)
+
+
+def _list_delay_changes(delays: tuple[tuple[str, float], ...]) -> list[Change]:
+    """Returns the change that delays each command by itself, if there are several."""
+    if len(delays) < 2:
+        return []
+    return [("a delay of each command", _change(delays=delays), WORTH)]
+
+
+def _is_certain(changed: shooting.Predictive, before: shooting.Predictive) -> bool:
     """True if dead zones and limits that a change added clearly exceed their standard errors."""
-    values = zip(
-        changed.draft.parameters.names,
-        changed.found.values.tolist(),
-        changed.found.value_errors.tolist(),
-        strict=True,
-    )
+    errors = changed.errors
     return not any(
-        value < CERTAIN * error
-        for name, value, error in values
-        if name.endswith((".dead", ".fall", ".rise"))
-        and name not in before.draft.parameters.names
+        value < CERTAIN * errors[name]
+        for name, value in changed.named.items()
+        if name.endswith((".dead", ".fall", ".rise")) and name not in before.names
     )
 
 
-def _list_follower_changes(
-    drive: Drive, calibration: Calibration, samples: Samples
-) -> Iterator[tuple[str, Callable[[forms.Form], forms.Form], float]]:
-    """Yields changes to the form of states that follow commands, as `list_changes` does."""
-    followed = forms.list_followed(drive)
-    if not followed:
-        return
-    shared = tuple((c, calibration.command_latency_s) for _, c in followed)
-    delays = "a delay of each command"
-    if len(shared) > 1:
-        yield delays, lambda form: replace(form, delays=shared), WORTH
+def _list_follower_changes(evidence: forms.Evidence) -> Iterator[Change]:
+    """Yields changes to the form of states that follow commands."""
+    followed = forms.list_followed(evidence.drive)
+    latency = evidence.calibration.command_latency_s
+    delays = _list_delay_changes(tuple((c, latency) for _, c in followed))
+    yield from delays
     for state, _ in followed:
         yield f"limits of {state}", partial(forms.add_limits, state=state), WORTH
-    if len(shared) > 1:
-        yield delays, lambda form: replace(form, delays=shared), WORTH
+    yield from delays
     for _, command in followed:
-        bent = partial(
-            forms.add_dead_zones, drive=drive, samples=samples, commands=(command,)
-        )
+        bent = partial(forms.add_dead_zones, evidence=evidence, commands=(command,))
         yield f"a dead zone of {command}", bent, WORTH
 
 
@@ -547,67 +511,59 @@ def describe_lag_sums(latency: float, lags: dict[str, float], beside: float) -> 
     return f"Latency ({latency:.3f} s) can't be separated from the lags: trust their sums, {sums}."
 
 
-def estimate_coefficient_errors(predictive: shooting.Predictive) -> Array:
-    """Returns standard errors (D, K) of the free coefficients; NaN for the others."""
-    span = max(shooting.HORIZONS_S)
-    cluster = np.floor((predictive.starts - predictive.starts.min()) / span).astype(
-        np.intp
-    )
-    errors = np.full(predictive.free.shape, np.nan)
-    errors[predictive.free] = estimate_clustered_errors(
-        predictive.jacobian, predictive.residual, cluster
-    )
-    return errors
-
-
 def drop_doubtful_mounting(
-    draft: Draft, calibration: Calibration, predictive: shooting.Predictive
+    draft: Draft, calibration: Calibration, found: shooting.Predictive
 ) -> Draft | None:
     """Returns a draft without the parts of its mounting below 3 standard errors; None if all stay.
 
     Removed parts are zero in the calibration that `add_predicted_mounting` returns.
     """
-    sigma = predictive.value_errors[-3:]
-    total = geometry.compose(predictive.values[-3:], calibration.mounting)
+    rest, sigma = _get_mounting(found)
+    total = geometry.compose(rest, calibration.mounting)
     doubtful = (np.abs(total) < CERTAIN * sigma) & (total != 0.0)
     if not doubtful.any():
         return None
     mounting = calibration.mounting
-    rest = predictive.values[-3:].copy()
     if doubtful[2]:
         rest[2] = -mounting[2]
     aside = geometry.rotate(mounting[:2], float(rest[2]))
     rest[:2] = np.where(doubtful[:2], -aside, rest[:2])
-    parameters = draft.parameters
+    parameters = draft.problem.parameters
+    places = [parameters.names.index(name) for name in MOUNTING]
     start = parameters.start.copy()
-    low = parameters.low.copy()
-    high = parameters.high.copy()
-    start[-3:] = rest
-    places = np.flatnonzero(doubtful) + len(start) - 3
-    low[places] = start[places]
-    high[places] = start[places]
-    return replace(
-        draft, parameters=replace(parameters, start=start, low=low, high=high)
+    start[places] = rest
+    known = np.isin(np.arange(len(start)), np.array(places)[doubtful])
+    parameters = replace(
+        parameters,
+        start=start,
+        low=np.where(known, start, parameters.low),
+        high=np.where(known, start, parameters.high),
     )
+    return replace(draft, problem=replace(draft.problem, parameters=parameters))
+
+
+def _get_mounting(found: shooting.Predictive) -> tuple[Array, Array]:
+    """Returns the pose (3,) of the tracked body that a search found, and its standard errors."""
+    named = found.named
+    errors = found.errors
+    pose = np.array([named[name] for name in MOUNTING])
+    return pose, np.array([errors[name] for name in MOUNTING])
 
 
 def add_predicted_mounting(
-    calibration: Calibration, predictive: shooting.Predictive
+    calibration: Calibration, found: shooting.Predictive
 ) -> Calibration:
     """Adds the mounting found by predictions to that of the calibration."""
-    x, y, heading = map(
-        float, geometry.compose(predictive.values[-3:], calibration.mounting)
-    )
-    names = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad")
+    rest, sigma = _get_mounting(found)
+    pose = geometry.compose(rest, calibration.mounting)
     known = dict(calibration.uncertainty)
-    errors = dict(zip(names, predictive.value_errors[-3:].tolist(), strict=True))
-    was_mounted = predictive.values[-2] != 0.0
-    if np.isnan(errors["lever_arm_y_m"]) and not was_mounted:
-        y = calibration.lever_arm_m[1]
-    for name, error in errors.items():
+    if np.isnan(sigma[1]) and rest[1] == 0.0:
+        pose[1] = calibration.lever_arm_m[1]
+    names = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad")
+    for name, error in zip(names, sigma.tolist(), strict=True):
         if not np.isnan(error):  # what the model lacks bends each of both estimates
             known[name] = max(error, known.get(name, 0.0))
-    x, y, heading = (0.0 if abs(part) < NOTHING else part for part in (x, y, heading))
+    x, y, heading = np.where(np.abs(pose) < NOTHING, 0.0, pose).tolist()
     return replace(
         calibration,
         rotation_rad=-heading,

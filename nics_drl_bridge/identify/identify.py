@@ -18,16 +18,20 @@ from typing import Any
 import numpy as np
 
 from nics_drl_bridge.errors import FitError, RecordingError
-from nics_drl_bridge.identify import (
-    acceptance,
-    open_loop,
-    verdict,
-)
 from nics_drl_bridge.identify import clocks as timings
 from nics_drl_bridge.identify import fit as fitting
-from nics_drl_bridge.identify import motion as motions
-from nics_drl_bridge.identify.assume import assume_textbook
-from nics_drl_bridge.identify.calibration import Calibration, Response, align
+from nics_drl_bridge.identify import judgement as judging
+from nics_drl_bridge.identify import open_loop, verdict
+from nics_drl_bridge.identify.calibration import (
+    Calibration,
+    Response,
+    add_motion,
+    align,
+    choose_half_width,
+    has_motion_as_state,
+    make_motion_grid,
+    make_surrogate,
+)
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.findings import (
     Findings,
@@ -44,7 +48,6 @@ from nics_drl_bridge.identify.forms import (
     find_likely_delay,
     list_driving_commands,
 )
-from nics_drl_bridge.identify.gyro import correct_heading_by_gyro
 from nics_drl_bridge.identify.judgement import (
     estimate_bands,
     fit_textbook,
@@ -62,11 +65,12 @@ from nics_drl_bridge.identify.repair import (
     check_encoders,
     check_pose_moves,
     check_units,
+    correct_heading_by_gyro,
     repair_rows,
 )
-from nics_drl_bridge.identify.signals import find_speed_index
 from nics_drl_bridge.identify.textbook_model import (
     add_actuator_state,
+    assume_textbook,
     make_actuated_spec,
     make_textbook_calibration,
     make_textbook_model,
@@ -213,7 +217,7 @@ class Identified:
         return self.findings.judgement
 
     @property
-    def assessment(self) -> acceptance.Assessment:
+    def assessment(self) -> judging.Assessment:
         """What the model is suitable for, and the reasons."""
         spec = self.drive.spec
         findings = self.findings
@@ -221,23 +225,23 @@ class Identified:
         unfit = mistaken or bool(verdict.list_missed(self.fit, spec))
         textbook = bool(findings.replacement)
         ratings = [
-            acceptance.rate(self.judgement, spec.footprint_radius, textbook),
-            acceptance.rate_unseen(
+            judging.rate(self.judgement, spec.footprint_radius, textbook),
+            judging.rate_unseen(
                 verdict.measure_time_without_pose(self.drive), self.drive.duration_s
             ),
         ]
         if unfit:
-            ratings.append(acceptance.Assessment(acceptance.Verdict.DO_NOT_TRAIN, ()))
+            ratings.append(judging.Assessment(judging.Verdict.DO_NOT_TRAIN, ()))
         doubtful = any(isinstance(note, verdict.Doubt) for note in self.notes)
         doubtful |= any(
-            acceptance.list_doubts_of_commands(self.judgement, self.calibration)
+            judging.list_doubts_of_commands(self.judgement, self.calibration)
         )
         if self.model.assumed or doubtful:
-            ratings.append(acceptance.Assessment(acceptance.Verdict.WITH_CARE, ()))
-        return acceptance.combine_ratings(ratings)
+            ratings.append(judging.Assessment(judging.Verdict.WITH_CARE, ()))
+        return judging.combine_ratings(ratings)
 
     @property
-    def verdict(self) -> acceptance.Verdict:
+    def verdict(self) -> judging.Verdict:
         """What the model is suitable for, as one of three verdicts."""
         return self.assessment.verdict
 
@@ -245,7 +249,7 @@ class Identified:
     def dead_zone(self) -> float:
         """Maximum of the driving command at which the robot stays at rest; 0 if none."""
         spec = self.drive.spec
-        driving = {spec.command[place].name for place in list_driving_commands(spec)}
+        driving = set(list_driving_commands(spec))
         if not driving:  # no textbook says what each command moves
             driving = {c.name for c in spec.command if not c.turns and c.unit != "rad"}
         return _find_dead_zone(self.model, driving)
@@ -315,8 +319,8 @@ def estimate_timing(drive: Drive, findings: Findings) -> Findings:
     spec = drive.spec
     timings.check_state_is_known(drive.recording, spec)
     responses: tuple[Response, ...] = ()
-    if motions.has_motion_as_state(spec, drive.recording):
-        by_command = replace(training, spec=motions.make_surrogate(spec))
+    if has_motion_as_state(spec, drive.recording):
+        by_command = replace(training, spec=make_surrogate(spec))
         timing = timings.measure_timing(by_command)
         responses, timing = _select_followers(spec, timing)
     else:
@@ -352,35 +356,17 @@ def _select_followers(
 
 def find_mounting(drive: Drive, findings: Findings) -> Findings:
     """Finds where and how the tracked body is mounted on the robot."""
-    training = findings.training
-    states = None
-    speed = None
-    if drive.spec.state and not motions.has_motion_as_state(
-        drive.spec, drive.recording
-    ):
-        states = timings.average_expected_states(
-            training, training.twists, findings.timing
-        )
-        index = find_speed_index(drive.spec)
-        if index is not None:
-            speed = states[:, index]
-    mounting = estimate_mounting(training, findings.timing, states)
-    return replace(
-        findings,
-        expected_speed=speed,
-        mounting=mounting,
-        calibration=apply_mounting(findings.calibration, mounting),
-    )
+    mounting = estimate_mounting(findings.training, findings.timing)
+    calibration = apply_mounting(findings.calibration, mounting)
+    return replace(findings, mounting=mounting, calibration=calibration)
 
 
 def find_responses(drive: Drive, findings: Findings) -> Findings:
     """Finds how unmeasured states follow the commands, and the scale of the wheels."""
     training = findings.training
     calibration = findings.calibration
-    if not motions.has_motion_as_state(drive.spec, drive.recording):
-        responses = timings.list_responses(
-            training, calibration, findings.timing, findings.expected_speed
-        )
+    if not has_motion_as_state(drive.spec, drive.recording):
+        responses = timings.list_responses(training, calibration, findings.timing)
         calibration = replace(calibration, responses=responses)
     return replace(
         findings, calibration=timings.add_wheel_scales(training, calibration)
@@ -399,16 +385,14 @@ def measure_noise(drive: Drive, findings: Findings) -> Findings:
 
 def derive_motion(drive: Drive, findings: Findings) -> Findings:
     """Derives the state from the poses, if it is an unmeasured part of the twist."""
-    if not motions.has_motion_as_state(drive.spec, drive.recording):
+    if not has_motion_as_state(drive.spec, drive.recording):
         return findings
     calibration = findings.calibration
-    width = motions.choose_half_width(findings.training)
+    width = choose_half_width(findings.training)
     parts = []
     for part in (findings.training, findings.whole):
-        grid = motions.make_motion_grid(
-            part, calibration, drive.settings.control_period_s
-        )
-        parts.append(motions.add_motion(part, calibration, grid, width))
+        grid = make_motion_grid(part, calibration, drive.settings.control_period_s)
+        parts.append(add_motion(part, calibration, grid, width))
     training, whole = parts
     return replace(findings, training=training, whole=whole, motion_width_s=width)
 
@@ -550,7 +534,7 @@ def prefer_textbook(drive: Drive, findings: Findings) -> Findings:
     """
     if findings.yardstick is None:
         return findings
-    if not acceptance.is_beaten_by_textbook(findings.judgement):
+    if not judging.is_beaten_by_textbook(findings.judgement):
         return findings
     best = findings
     for one_limit in (True, False):
@@ -564,8 +548,7 @@ def prefer_textbook(drive: Drive, findings: Findings) -> Findings:
 def _measure_error(findings: Findings) -> float:
     """Returns the error of a judged model after 5 s, or at the longest horizon [m]."""
     errors = [
-        at.model.position_m
-        for at in acceptance.select_usual_horizon(findings.judgement)
+        at.model.position_m for at in judging.select_usual_horizon(findings.judgement)
     ]
     return min(errors, default=np.inf)
 
@@ -593,7 +576,7 @@ def _try_textbook(drive: Drive, findings: Findings, one_limit: bool) -> Findings
     textbook = make_textbook_model(yardstick, model, samples, spec)
     if textbook is None:
         return None
-    (lost,) = acceptance.select_usual_horizon(findings.judgement)
+    (lost,) = judging.select_usual_horizon(findings.judgement)
     start = replace(
         start,
         model=textbook,

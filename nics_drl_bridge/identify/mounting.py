@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify import clocks
-from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.calibration import Calibration, has_motion_as_state
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import (
     average_held,
@@ -21,10 +21,14 @@ from nics_drl_bridge.identify.statistics import (
     estimate_standard_errors,
 )
 from nics_drl_bridge.identify.terms import has_slipping_tyres, list_reversed_variables
-from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.kernels import MAX_ORDER
-from nics_drl_bridge.robot.kinds import compute_steady_twist, has_textbook, slips
+from nics_drl_bridge.robot.kinds import (
+    compute_steady_twist,
+    has_textbook,
+    slips,
+    textbook,
+)
 from nics_drl_bridge.robot.spec import RobotSpec
 
 TURN_SCALE_M = 0.2  # weight of a yaw rate: the speed at this distance
@@ -36,7 +40,6 @@ ONE_WAY = 0.05
 # a smaller in-plane part of the direction without extent means that the body never turned
 FLAT = 0.02
 MIN_LENGTH = 1e-4  # m, rad
-REGULAR = 0.8
 BLOCKS = 8
 STRONG = 10.0  # instruments with a smaller F are weak (Staiger, Stock 1997)
 SAME = 1e-6  # minimum part of an instrument that differs from the others
@@ -70,10 +73,8 @@ class Mounting:
         return why, why
 
 
-def estimate_mounting(
-    drive: Drive, timing: clocks.TimingEstimate, states: Array | None
-) -> Mounting | None:
-    """Estimates the mounting from states (n, S) at gain one; None if the drive does not show it."""
+def estimate_mounting(drive: Drive, timing: clocks.TimingEstimate) -> Mounting | None:
+    """Estimates the mounting; None if the drive does not show it."""
     spec = drive.spec
     twists = drive.twists
     if not (has_textbook(spec) or spec.takes_cmd_vel):
@@ -87,23 +88,21 @@ def estimate_mounting(
     forward = _predict_twists(spec, command)[:, 0]
     _, noise = drive.pose_noise or (0.0, 0.0)
     mounting = estimate_mounting_without_lateral_motion(twists, forward, noise)
-    if (
-        mounting is not None
-        and states is None
-        and (has_slipping_tyres(spec) or slips(spec))
-    ):
-        return estimate_mounting_with_slip(twists, mounting, spec)
-    if mounting is None or states is None:
+    if mounting is None:
+        return None
+    if not spec.state or has_motion_as_state(spec, drive.recording):
+        if has_slipping_tyres(spec) or slips(spec):
+            return estimate_mounting_with_slip(twists, mounting, spec)
         return mounting
+    states = clocks.average_expected_states(drive, twists, timing)
     if drive.recording.state is None or np.isnan(mounting.lever_sigma[0]):
         mounting = (
             estimate_mounting_by_instruments(twists, states, forward, spec) or mounting
         )
     place = find_speed_index(spec)
     if place is not None and np.isnan(mounting.lever_sigma).tolist() == [False, True]:
-        speed = states[:, place]
         mounting.lever[1], mounting.lever_sigma[1] = estimate_lateral_lever(
-            twists, mounting.rotation, speed
+            twists, mounting.rotation, states[:, place]
         )
     return mounting
 
@@ -289,17 +288,23 @@ def _estimate_by_commands(
     spec = drive.spec
     twists = drive.twists
     inferred = recording.state is None and any(v.twist for v in spec.state)
-    if spec.state and not inferred:
-        command = _convert_to_commands(
-            clocks.average_expected_states(drive, twists, timing), drive, timing.latency
-        )
-    else:
+    if not spec.state or inferred:
         begin = twists.start + timing.offset - timing.latency
         command = average_held(
             recording.command, spec, begin, begin + twists.end - twists.start
         )
+        expected = _predict_twists(spec, command)
+    else:
+        states = clocks.average_expected_states(drive, twists, timing)
+        if recording.state is None:
+            command = states[:, np.argsort(list_followed_commands(spec))]
+            expected = _predict_twists(spec, command)
+        elif has_textbook(spec):
+            expected = textbook(spec).twist(states)
+        else:
+            return None  # nothing says how its states move it
     # of base_link, up to one factor
-    return estimate_mounting_by_twists(twists, _predict_twists(spec, command))
+    return estimate_mounting_by_twists(twists, expected)
 
 
 def estimate_mounting_by_twists(
@@ -340,38 +345,3 @@ def _predict_twists(spec: RobotSpec, command: Array) -> Array:
     if spec.takes_cmd_vel:
         return spec.to_fields(command)
     return compute_steady_twist(spec, command)
-
-
-def _convert_to_commands(states: Array, drive: Drive, latency: float) -> Array:
-    """Converts states (n, S) to the commands (n, C) that would sustain them."""
-    stream = drive.recording.state
-    command = drive.recording.command
-    spec = drive.spec
-    if stream is None:
-        return states[:, np.argsort(list_followed_commands(spec))]
-    span = np.diff(stream.t)
-    keep = (span > 0.0) & (span < clocks.LONG_STEP * np.median(span))
-    keep &= _select_fresh(command, stream.t[:-1] - latency)
-    rates = np.diff(stream.values, axis=0)[keep] / span[keep, None]
-    before = stream.values[:-1][keep]
-    begin = stream.t - latency
-    u = average_held(command, spec, begin[:-1][keep], begin[1:][keep])
-    # With more wheels than degrees of freedom, the rest of their speeds is slip, not commands.
-    ways = np.linalg.svd(before, full_matrices=False)[2][: u.shape[1]].T
-    chi = np.concatenate([before @ ways, u, np.ones((len(u), 1))], axis=1)
-    beta = np.linalg.lstsq(chi, rates @ ways, rcond=1e-9)[0]
-    size = ways.shape[1]
-    steady = -np.linalg.pinv(beta[:size].T, rcond=1e-6) @ beta[size:-1].T
-    return np.asarray(states @ ways @ np.linalg.pinv(steady).T)
-
-
-def _select_fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
-    """Selects the times (n,) at which the command is known, outside gaps of regular rows."""
-    span = np.diff(command.t)
-    usual = float(np.median(span)) if len(span) else 0.0
-    if not (span < clocks.LONG_STEP * usual).mean() > REGULAR:
-        return np.ones(len(start), dtype=np.bool_)
-    row = np.searchsorted(command.t, start + 1e-9, "right") - 1
-    return np.asarray(
-        np.append(span, 0.0)[np.clip(row, 0, None)] < clocks.LONG_STEP * usual
-    )

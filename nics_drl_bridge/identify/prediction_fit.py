@@ -27,6 +27,7 @@ from nics_drl_bridge.identify.findings import (
     resample_drive,
 )
 from nics_drl_bridge.identify.fit import ORDER
+from nics_drl_bridge.identify.forms import Evidence
 from nics_drl_bridge.identify.terms import (
     Kind,
     Library,
@@ -51,12 +52,12 @@ def fit_by_predictions(drive: Drive, findings: Findings) -> Findings:
     order = drive.settings.order
     library = make_library(drive, findings)
     samples = resample_drive(training, findings)
+    evidence = Evidence(training, findings.calibration, samples, library)
     try:
-        data = (training, findings.calibration, samples, library)
         if findings.base is None:
-            base = hypotheses.fit_base(*data, findings.clear_curves)
+            base = hypotheses.fit_base(evidence, findings.clear_curves)
         else:
-            base = hypotheses.refit_base(*data, findings.base)
+            base = hypotheses.refit_base(evidence, findings.base)
         trials = findings.trials  # a refit reuses the choice
         trials = trials or base.draft.cross_validate(
             hypotheses.list_hypotheses(order, library)
@@ -64,7 +65,7 @@ def fit_by_predictions(drive: Drive, findings: Findings) -> Findings:
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
     best = hypotheses.choose_trial(trials, order)
-    curves = base.draft.form.curves_at(base.draft.parameters, base.found.values)
+    curves = base.draft.form.make_curves(base.found.named)
     if library.kind is Kind.MOTION:
         calibration = replace(findings.calibration, inputs=curves)
         findings = replace(findings, calibration=calibration)
@@ -107,7 +108,7 @@ def refine_by_predictions(drive: Drive, findings: Findings) -> Findings:
     calibration = findings.calibration
     draft = base.draft
     found, has_order = _search_model(draft, base, terms, best)
-    if draft.problem.mounted:
+    if draft.problem.is_mounted:
         certain = hypotheses.drop_doubtful_mounting(draft, calibration, found)
         if certain is not None:
             errors = hypotheses.add_predicted_mounting(calibration, found).uncertainty
@@ -116,16 +117,14 @@ def refine_by_predictions(drive: Drive, findings: Findings) -> Findings:
             found, has_order = _search_model(draft, base, terms, best)
     if draft.library.kind is not Kind.MOTION:
         found = draft.prune(found, drive.settings.alpha)
-    before = draft.form.latency_at(draft.parameters, found.values)
+    before = draft.form.find_latency(found.named)
     calibration = draft.calibrate(found, calibration)
-    values = found.values.copy()
-    if draft.problem.mounted:  # the calibration has the mounting now
-        values[-3:] = 0.0
-    parameters = replace(draft.parameters, start=values)
-    draft = replace(
-        draft,
-        parameters=parameters.shift_stamps(before - calibration.command_latency_s),
-    )
+    # The calibration has the mounting now.
+    is_mounting = np.isin(found.names, hypotheses.MOUNTING)
+    parameters = draft.problem.parameters
+    parameters = replace(parameters, start=np.where(is_mounting, 0.0, found.values))
+    parameters = parameters.shift_stamps(before - calibration.command_latency_s)
+    draft = replace(draft, problem=replace(draft.problem, parameters=parameters))
     base = replace(base, draft=draft)
     if draft.library.kind is Kind.MOTION:
         calibration, sums = _separate_lags(base, calibration, drive.spec)
@@ -156,7 +155,7 @@ def _add_sums(
     errors = dict(calibration.uncertainty)
     if not errors.get("command_latency_s", 0.0) > SEPARABLE_S:
         return calibration
-    names = list(draft.parameters.names)
+    names = list(found.names)
     for state, command in draft.form.followed:
         delay = f"{command}.delay"
         pair = [names.index(delay if delay in names else "latency")]
@@ -185,9 +184,11 @@ def _search_model(
     """
     if best.pull:
         refined = draft.refine(base.found.model, terms, pull=best.pull)
-        if not verdict.is_worse(
-            draft.measure_error(refined), draft.measure_error(base.found)
-        ):
+        errors = (
+            draft.problem.measure_mean_error(fitted.model, fitted.values)
+            for fitted in (refined, base.found)
+        )
+        if not verdict.is_worse(*errors):
             return refined, True
     textbook = draft.fit_base(other=base.found.model)
     return textbook, best.pull == 0.0
@@ -197,12 +198,12 @@ def _separate_lags(
     base: hypotheses.Base, calibration: Calibration, spec: RobotSpec
 ) -> tuple[Calibration, tuple[str, ...]]:
     """Drops the latency's error where lags hide it; returns a sentence on their sums instead."""
-    draft = base.draft
-    curves = draft.form.curves_at(draft.parameters, base.found.values)
+    form = base.draft.form
+    curves = form.make_curves(base.found.named)
     lags = hypotheses.find_lags(replace(base.found.model, inputs=curves), spec)
     if not lags:
         return calibration, ()
-    beside = draft.form.latency_at(draft.parameters, base.found.values)
+    beside = form.find_latency(base.found.named)
     sums = hypotheses.describe_lag_sums(calibration.command_latency_s, lags, beside)
     errors = dict(calibration.uncertainty)
     errors.pop("command_latency_s", None)

@@ -1,4 +1,4 @@
-"""Repair of a drive: faulty rows, localiser jumps, commands; refuses wrong units and axes."""
+"""Repair of a drive: faulty rows, jumps, commands, heading; refuses wrong units and axes."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -22,8 +22,15 @@ from nics_drl_bridge.identify.signals import (
 from nics_drl_bridge.identify.statistics import compute_unexplained
 from nics_drl_bridge.identify.verdict import Doubt, Gap, Mistake
 from nics_drl_bridge.recording import recording as recordings
+from nics_drl_bridge.recording.heading import (
+    CLEARLY,
+    WINDOW_S,
+    Turning,
+    compare_turning,
+    turn_by_gyro,
+)
 from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.recording import HeadingKeys
+from nics_drl_bridge.recording.recording import HeadingKeys, Recording
 from nics_drl_bridge.recording.stamping import select_new_rows
 from nics_drl_bridge.robot.kinds import has_textbook, textbook
 from nics_drl_bridge.robot.spec import FARTHEST_STEERED, RobotSpec
@@ -90,7 +97,6 @@ def repair_rows(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
     for repair in (
         _drop_repetitions,
         _drop_held_poses,
-        _cut_held_end,
         _drop_outliers,
         _join_at_jumps,
         _clip_commands,
@@ -117,66 +123,61 @@ def _drop_repetitions(drive: Drive, notes: list[str]) -> recordings.Recording:
 
 
 def _drop_held_poses(drive: Drive, notes: list[str]) -> recordings.Recording:
-    """Removes poses frozen where tracking was lost, which leaves a gap.
+    """Removes poses frozen where tracking was lost, which leaves a gap or ends the drive.
 
     A robot at rest also keeps its place, but continues from there.
     """
     recording = drive.recording
     t = drive.sample_t
-    pose = drive.recording.pose.values
+    pose = recording.pose.values
     if len(t) < 2:
         return recording
     reach = REACH * _find_largest_speed(drive.spec) * np.diff(t)
-    leap = np.hypot(*np.diff(pose[:, :2], axis=0).T) > np.maximum(reach, 1e-6)
-    same = np.concatenate([[False], (pose[1:] == pose[:-1]).all(axis=1)])
-    held = np.zeros(len(t), dtype=np.bool_)
-    for last in np.flatnonzero(same[:-1] & leap):
-        changes = np.flatnonzero(~same[: last + 1])
-        first = changes[-1]
-        if t[last] - t[first] >= HELD_S:
-            held[first + 1 : last + 1] = True
-    if not held.any():
-        return recording
-    begins = np.flatnonzero(held & ~np.concatenate([[False], held[:-1]])) - 1
-    ends = np.flatnonzero(held & ~np.concatenate([held[1:], [False]]))
+    leap = np.hypot(*np.diff(pose[:, :2], axis=0).T)
+    moved = np.append(True, (pose[1:] != pose[:-1]).any(axis=1))
+    # Each run of equal poses begins with one that moved, and ends before the next.
+    begins = np.flatnonzero(moved)
+    ends = np.append(begins[1:], len(t)) - 1
+    kept = np.ones(len(t), dtype=np.bool_)
     for begin, end in zip(begins, ends, strict=True):
+        if end == begin or t[end] - t[begin] < HELD_S:
+            continue
         span = f"from {t[begin] - t[0]:.1f} s to {t[end] - t[0]:.1f} s"
-        leap_m = np.hypot(*(pose[end + 1] - pose[end])[:2])
-        finding = f"The pose keeps one value {span} and then leaps by {leap_m:.2f} m"
-        cause = "as if tracking was lost: these rows were left out"
-        notes.append(f"{finding}, {cause}.")  # another note reports the gap
-    return _select_rows(recording, "pose", ~held)
+        finding = f"The pose keeps one value {span}"
+        if end < len(t) - 1:
+            if leap[end] <= max(reach[end], 1e-6):
+                continue
+            cause = "as if tracking was lost: these rows were left out"
+            # another note reports the gap
+            notes.append(f"{finding} and then leaps by {leap[end]:.2f} m, {cause}.")
+        elif moved[:begin].all() and _asks_to_move(drive, float(t[begin])):
+            cause = "though commands ask the robot to move, as if tracking was lost"
+            notes.append(Gap(f"{finding}, {cause}: the drive ends there."))
+        else:
+            continue
+        kept[begin + 1 : end + 1] = False
+    return recording if kept.all() else _select_rows(recording, "pose", kept)
+
+
+def _asks_to_move(drive: Drive, after_s: float) -> bool:
+    """True if commands ask the robot to move after a time of its poses [s]."""
+    pose = drive.recording.pose
+    command = drive.recording.command
+    if pose.clock != command.clock:
+        return False
+    driving = list_driving_commands(drive.spec)
+    columns = [c.name in driving for c in drive.spec.command]
+    asked = np.abs(command.values[:, columns])
+    late = asked[(command.t > after_s) & (command.t < pose.t[-1])]
+    return bool(len(late)) and bool(
+        (late.mean(axis=0) > ASKS * asked.max(axis=0)).any()
+    )
 
 
 def _find_largest_speed(spec: RobotSpec) -> float:
     """Returns the largest magnitude of the commands that do not turn the robot; 0 without any."""
     sizes = [max(abs(c.min), abs(c.max)) for c in spec.command if not c.turns]
     return max(sizes, default=0.0)
-
-
-def _cut_held_end(drive: Drive, notes: list[str]) -> recordings.Recording:
-    """Ends a drive where its pose froze for good, though commands asked the robot to move.
-
-    Only a pose that otherwise never repeats itself, as noise sees to, shows this by itself.
-    """
-    recording = drive.recording
-    pose = recording.pose
-    command = recording.command
-    if len(pose.t) < 2 or pose.clock != command.clock:
-        return recording
-    same = np.append(False, (pose.values[1:] == pose.values[:-1]).all(axis=1))
-    last = int(np.flatnonzero(~same)[-1])  # that moved
-    if last == 0 or same[:last].any() or pose.t[-1] - pose.t[last] < HELD_S:
-        return recording
-    asked = np.abs(command.values[:, list(list_driving_commands(drive.spec))])
-    held = (command.t > pose.t[last]) & (command.t < pose.t[-1])
-    if not held.any() or (asked[held].mean(axis=0) <= ASKS * asked.max(axis=0)).all():
-        return recording
-    begin, end = pose.t[[last, -1]] - pose.t[0]
-    finding = f"The pose keeps one value from {begin:.1f} s to its end, {end:.1f} s"
-    cause = "though commands ask the robot to move, as if tracking was lost"
-    notes.append(Gap(f"{finding}, {cause}: the drive ends there."))
-    return _select_rows(recording, "pose", np.arange(len(pose.t)) <= last)
 
 
 def _drop_outliers(drive: Drive, notes: list[str]) -> recordings.Recording:
@@ -227,19 +228,10 @@ def _join_at_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
     """Moves all poses after a localiser jump to where the motion before it leads."""
     recording = drive.recording
     t = drive.sample_t
-    pose = drive.recording.pose.values
-    span = np.diff(t)
-    if len(span) < 2 * AROUND + 1:
+    pose = recording.pose.values
+    if len(t) < 2 * AROUND + 2:
         return recording
-    moved = geometry.log(geometry.between(pose[:-1], pose[1:]))
-    around = np.pad(
-        moved / np.maximum(span, 1e-9)[:, None], ((AROUND, AROUND), (0, 0)), "edge"
-    )
-    usual = np.median(sliding_window_view(around, 2 * AROUND + 1, axis=0), axis=2)
-    expected = usual * span[:, None]
-    apart = np.stack(
-        [np.hypot(*(moved - expected)[:, :2].T), np.abs((moved - expected)[:, 2])]
-    )
+    expected, apart = _compare_steps(t, pose)
     jump = (apart > _limit_steps(drive, apart)).any(axis=0)
     if not jump.any() or jump.mean() > MOST_JUMPS:
         return recording
@@ -247,9 +239,8 @@ def _join_at_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
     descriptions = []
     for k in np.flatnonzero(jump):
         here = geometry.compose(joined[k], geometry.exp(expected[k]))
-        joined[k + 1 :] = geometry.compose(
-            here, geometry.between(joined[k + 1], joined[k + 1 :])
-        )
+        after = geometry.between(joined[k + 1], joined[k + 1 :])
+        joined[k + 1 :] = geometry.compose(here, after)
         size = f"{apart[0, k]:.2f} m, {apart[1, k]:.2f} rad"
         descriptions.append(f"at {t[k + 1] - t[0]:.2f} s ({size})")
     places = ", ".join(descriptions[:MOST_LISTED])
@@ -259,6 +250,20 @@ def _join_at_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
     split = "the drive is split there and continues from where it was before"
     notes.append(Gap(f"pose: {finding}; {split}."))
     return replace(recording, pose=replace(recording.pose, values=joined))
+
+
+def _compare_steps(t: Array, pose: Array) -> tuple[Array, Array]:
+    """Returns the usual motion (T - 1, 3) around each step, and how far it is from that (2, T - 1).
+
+    The distances are in m and rad.
+    """
+    span = np.diff(t)[:, None]
+    moved = geometry.log(geometry.between(pose[:-1], pose[1:]))
+    around = np.pad(moved / np.maximum(span, 1e-9), ((AROUND, AROUND), (0, 0)), "edge")
+    windows = sliding_window_view(around, 2 * AROUND + 1, axis=0)
+    expected = np.median(windows, axis=2) * span
+    off = moved - expected
+    return expected, np.stack([np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2])])
 
 
 def _limit_steps(drive: Drive, apart: Array) -> Array:
@@ -344,9 +349,8 @@ def _measure_unexplained_rates(
     rates = np.diff(state.values, axis=0)[keep] / span[keep, None]
     row = np.searchsorted(recording.command.t, state.t[:-1][keep] + 1e-9, "right") - 1
     u = command[np.clip(row, 0, len(command) - 1)]
-    chi = np.concatenate([np.ones((len(u), 1)), state.values[:-1][keep], u], axis=1)
-    rest = rates - chi @ np.linalg.lstsq(chi, rates, rcond=None)[0]
-    return float(((rest / np.maximum(rates.std(axis=0), 1e-9)) ** 2).mean())
+    chi = np.concatenate([state.values[:-1][keep], u], axis=1)
+    return float((compute_unexplained(chi, rates) ** 2).mean())
 
 
 def check_units(drive: Drive) -> None:
@@ -478,10 +482,7 @@ def check_encoders(drive: Drive) -> tuple[str, ...]:
         names = [c.name for c in spec.command]
         per_wheel = book.compute_twist(unit_speeds)
         fault = "its sign is reversed, as if its encoder counts backwards"
-    effect = np.linalg.lstsq(turned, driven, rcond=1e-3)[0]  # (wheels, 3)
-    rest = driven - turned @ effect
-    power = np.maximum((driven**2).mean(axis=0), 1e-12)
-    explained = 1.0 - (rest**2).mean(axis=0) / power
+    effect, explained = _explain_motion(turned, driven)
     dofs = [d for d in (0, 2) if np.abs(per_wheel[:, d]).min() > 0.0]
     if not dofs or explained[dofs].min() < SWAPPED:
         return ()
@@ -491,6 +492,14 @@ def check_encoders(drive: Drive) -> tuple[str, ...]:
         Mistake(f"{names[i]} {finding}: {fault}; write `scale: -1` for it.")
         for i in np.flatnonzero(is_reversed)
     )
+
+
+def _explain_motion(sent: Array, driven: Array) -> tuple[Array, Array]:
+    """Returns the effect (K, D) of inputs (n, K), and the share (D,) of motions it explains."""
+    effect = np.linalg.lstsq(sent, driven, rcond=1e-3)[0]
+    rest = ((driven - sent @ effect) ** 2).mean(axis=0)
+    power = np.maximum((driven**2).mean(axis=0), 1e-12)
+    return np.asarray(effect), np.asarray(1.0 - rest / power)
 
 
 def _average_inputs(
@@ -548,25 +557,15 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]
     if sorted(keys) != sorted(SIDEWAYS) or len(start) < MIN_COMPARED:
         return ()
     order = [keys.index(key) for key in SIDEWAYS]
-    best = np.zeros((3, 3))
-    for delay in DELAYS_S:
-        asked = average_held(command, spec, start - delay, end - delay)[:, order]
-        with np.errstate(invalid="ignore"):  # commands that never changed
-            alike = np.nan_to_num(np.corrcoef(asked.T, driven.T)[:3, 3:])
-        # a rotated mounting moves the sensor sideways
-        if np.abs(alike).sum() > np.abs(best).sum():
-            best = alike
-            chi = np.column_stack([asked, driven[:, 2]])
-            way = np.linalg.lstsq(chi, driven[:, :2], rcond=None)[0]
-    along = np.hypot(best[:, 0], best[:, 1])
-    size = np.abs(best)
-    for k, straight in enumerate(along[:2] + size[2, 2]):
-        _check_swapped(drive, [order[k], order[2]], min(along[2], size[k, 2]), straight)
-    # opposite signs come from poses rotated by 90 degrees
-    if best[0, 1] * best[1, 0] > 0.0:
-        _check_swapped(
-            drive, order[:2], min(size[0, 1], size[1, 0]), size[0, 0] + size[1, 1]
-        )
+    trials = [
+        average_held(command, spec, start - delay, end - delay)[:, order]
+        for delay in DELAYS_S
+    ]
+    asked, best = _find_most_alike(trials, driven)
+    _refuse_swapped_sideways(drive, order, best)
+    # a rotated mounting moves the sensor sideways
+    chi = np.column_stack([asked, driven[:, 2]])
+    way = np.linalg.lstsq(chi, driven[:, :2], rcond=None)[0]
     if np.linalg.det(best[:2, :2]) > -(SWAPPED**2) or np.linalg.det(way[:2]) > 0.0:
         return ()
     ahead, left = (spec.command[k].name for k in order[:2])
@@ -576,6 +575,35 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]
     cause = "one of them has the wrong sign, or the recording is a mirror image"
     consequence = "(y and heading reversed); the model moves as recorded"
     return (Mistake(f"{finding}: {cause} {consequence}."),)
+
+
+def _refuse_swapped_sideways(drive: Drive, order: list[int], alike: Array) -> None:
+    """Refuses two swapped commands of a robot that moves sideways.
+
+    Args:
+        drive: the drive.
+        order: places of the commands that move it along x and y and turn it.
+        alike: (3, 3) their correlations with these motions.
+    """
+    size = np.abs(alike)
+    along = np.hypot(alike[:, 0], alike[:, 1])
+    for k, straight in enumerate(along[:2] + size[2, 2]):
+        _check_swapped(drive, [order[k], order[2]], min(along[2], size[k, 2]), straight)
+    # opposite signs come from poses rotated by 90 degrees
+    if alike[0, 1] * alike[1, 0] > 0.0:
+        _check_swapped(
+            drive, order[:2], min(size[0, 1], size[1, 0]), size[0, 0] + size[1, 1]
+        )
+
+
+def _find_most_alike(trials: list[Array], driven: Array) -> tuple[Array, Array]:
+    """Returns the motion (n, K) that most resembles the driven one, and their correlations."""
+    count = driven.shape[1]
+    with np.errstate(invalid="ignore"):  # commands that never changed
+        alike = [np.corrcoef(asked.T, driven.T)[:count, count:] for asked in trials]
+    alike = [np.nan_to_num(correlation) for correlation in alike]
+    best = int(np.argmax([np.abs(correlation).sum() for correlation in alike]))
+    return trials[best], alike[best]
 
 
 def _measure_twists(t: Array, pose: Array) -> tuple[Array, Array, Array]:
@@ -622,21 +650,17 @@ def _compare_commands(
     axis = np.sqrt(((moved[:, 0] + 1j * moved[:, 1]) ** 2).sum())
     axis = axis / max(abs(axis), 1e-9)
     driven = np.stack([moved[:, :2] @ [axis.real, axis.imag], moved[:, 2]], axis=1)
-    asked = driven
-    correlation = np.zeros((2, 2))
+    trials = []
     for delay in DELAYS_S:
         sent = average_held(command, spec, start - delay, end - delay)
-        trial = np.zeros_like(driven)
+        asked = np.zeros_like(driven)
         if places:
-            trial[:, places] = sent
+            asked[:, places] = sent
         else:
-            trial[:] = textbook(spec).compute_twist(sent)[:, [0, 2]]
-        with np.errstate(invalid="ignore"):  # commands that never changed
-            alike = np.abs(np.nan_to_num(np.corrcoef(trial.T, driven.T)[:2, 2:]))
-        if alike.sum() > correlation.sum():
-            asked = trial
-            correlation = alike
-    return asked, driven, correlation
+            asked[:] = textbook(spec).compute_twist(sent)[:, [0, 2]]
+        trials.append(asked)
+    asked, alike = _find_most_alike(trials, driven)
+    return asked, driven, np.abs(alike)
 
 
 def check_axes(drive: Drive) -> None:
@@ -647,9 +671,8 @@ def check_axes(drive: Drive) -> None:
     noise = TRAVEL_NOISE * (drive.pose_noise or (0.0, 0.0))[0]
     apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, noise, 1e-3)
     spaced = drive.dated.rows(recordings.select_along_path(values, apart))
-    if drive.spec.moves_sideways:
-        keys = _find_mirrored_heading(spaced, drive)
-    else:
+    keys = HeadingKeys.NONE
+    if not drive.spec.moves_sideways:
         keys = recordings.find_clockwise_keys(spaced.values)
     if keys is HeadingKeys.NONE:
         keys = _find_heading_by_inputs(spaced.values, drive)
@@ -668,22 +691,6 @@ def check_axes(drive: Drive) -> None:
     raise RecordingError(
         f"{recording.source}: pose: {fault}: {advice}; or {alternative} (REP-103)."
     )
-
-
-def _find_mirrored_heading(pose: recordings.Stream, drive: Drive) -> HeadingKeys:
-    """Finds if only mirrored headings make the measured state explain the poses."""
-    state = drive.recording.state
-    if state is None or state.clock != drive.recording.pose.clock:
-        return HeadingKeys.NONE
-    if not recordings.has_visible_axes(pose.values):
-        return HeadingKeys.NONE
-    as_recorded = _measure_explained(pose.t, pose.values, state)
-    mirrored = _measure_explained(
-        pose.t, pose.values * np.array([1.0, 1.0, -1.0]), state
-    )
-    if mirrored > max(recordings.MIN_MIRRORED, recordings.BETTER + as_recorded):
-        return HeadingKeys.MIRRORED
-    return HeadingKeys.NONE
 
 
 def _find_heading_by_inputs(spaced: Array, drive: Drive) -> HeadingKeys:
@@ -721,12 +728,139 @@ def _explain_velocity(drive: Drive, pose: Array) -> float:
     return max(explained)
 
 
-def _measure_explained(t: Array, pose: Array, state: recordings.Stream) -> float:
-    """Returns the fraction (0 to 1) of the body velocity between poses that the state explains."""
-    span = np.diff(t)
-    keep = span > 0.0
-    velocity = (
-        geometry.log(geometry.between(pose[:-1], pose[1:]))[keep, :2] / span[keep, None]
+LEAST_COVERED = 0.9  # minimum fraction of a drive that the gyro must cover
+# deviation from 1 of the ratio of turns, above which the gyro does not match a tracker
+UNLIKE_TRACKER = 0.1
+
+
+def correct_heading_by_gyro(recording: Recording) -> Recording:
+    """Returns a recording whose odometry turns by the gyro, if one was recorded and the two differ.
+
+    `gyro` then holds the comparison. Other poses are compared but not changed; `repairs` gets a
+    sentence on the finding.
+    """
+    if recording.imu is None or recording.gyro is not None:
+        return recording
+    if recording.imu.clock != recording.pose.clock:
+        sentence = "The gyro is on another clock than the pose, so it was not compared with it."
+        return replace(recording, repairs=(*recording.repairs, sentence))
+    pose = recording.pose
+    gyro_t = recording.imu.t
+    yaw_rate = recording.imu.values[:, 2]
+    turning = compare_turning(pose.t, pose.values, gyro_t, yaw_rate)
+    if turning is None or not turning.compared:
+        return recording
+    sentences = tuple(_describe_turning(recording, turning))
+    if not _is_credible(recording, turning):
+        return replace(recording, repairs=(*recording.repairs, *sentences))
+    if recording.measured_by == "odometry" and turning.contradicts:
+        turned, covered = turn_by_gyro(pose.t, pose.values, gyro_t, yaw_rate, turning)
+        if covered < LEAST_COVERED:
+            sentences = (
+                f"The gyro covers only {covered:.0%} of the drive, so the heading is that of "
+                "odometry, which it contradicts; record its topic without gaps.",
+            )
+            return replace(recording, repairs=(*recording.repairs, *sentences))
+        pose = replace(pose, values=turned)
+    return replace(
+        recording, pose=pose, gyro=turning, repairs=(*recording.repairs, *sentences)
     )
-    means = average_between_stamps(state.t, state.values, t[:-1][keep], t[1:][keep])
-    return 1.0 - float((compute_unexplained(means, velocity) ** 2).mean())
+
+
+def describe_reference(recording: Recording) -> str:
+    """States what the errors of a model learnt from a recording are relative to."""
+    by = recording.measured_by
+    turning = recording.gyro
+    if by == "truth":
+        return ""
+    if by == "tracker":
+        return "That is relative to motion capture or a localiser."
+    if by == "odometry" and turning is not None:
+        if turning.contradicts:
+            return (
+                "That is relative to odometry with its heading from the gyro, which contradicts "
+                f"odometry's own by {turning.apart:.2g} rad in {WINDOW_S:g} s; nothing here shows "
+                "how far the path drifts."
+            )
+        return (
+            "That is relative to odometry, whose heading the gyro confirms; nothing here shows "
+            "how far the path drifts."
+        )
+    if by == "odometry":
+        return "That is relative to odometry; nothing here shows how far that drifts."
+    return (
+        "That is relative to the recorded pose; nothing here shows whether it is odometry, which "
+        "drifts."
+    )
+
+
+def _is_credible(recording: Recording, turning: Turning) -> bool:
+    """True if the gyro is credible, given this pose."""
+    if not turning.plausible:
+        return False
+    if recording.measured_by == "odometry":
+        return True
+    return abs(turning.scale - 1.0) < UNLIKE_TRACKER or not turning.contradicts
+
+
+def _describe_turning(recording: Recording, turning: Turning) -> Iterator[str]:
+    """Yields a sentence on how gyro and pose turn."""
+    if turning.mirrored:
+        yield Mistake(
+            "The gyro turns against the heading: one of them is mirrored, and the gyro was not "
+            "used. Counter-clockwise is positive; write `scale: -1` beside its `from:`, or fix "
+            "its driver."
+        )
+        return
+    if turning.in_degrees:
+        yield Mistake(
+            f"The gyro turns {1.0 / turning.scale:.3g} times as far as the heading, as degrees "
+            "would, and was not used: write `unit: deg/s` beside its `from:`, or fix its driver."
+        )
+        return
+    if not turning.plausible:
+        yield (
+            "The gyro does not turn as the heading does (correlation "
+            f"{turning.alike:.2f}), and was not used: find out which of them is wrong."
+        )
+        return
+    if turning.rest_s > 0.0:
+        where = f"over {turning.rest_s:.1f} s at rest"
+    else:
+        where = "while driving"
+    bias = (
+        f"bias of {turning.bias:.4f} +- {turning.bias_std:.2g} rad/s was found {where}"
+    )
+    agrees = recording.measured_by == "tracker" and _is_credible(recording, turning)
+    if agrees or not turning.contradicts:
+        yield (
+            f"The gyro confirms the heading: they differ by {turning.apart:.2g} rad in "
+            f"{WINDOW_S:g} s; its {bias}."
+        )
+        return
+    differ = f"by {turning.apart:.2g} rad in {WINDOW_S:g} s"
+    if recording.measured_by == "odometry":
+        slip = ""
+        if abs(turning.scale - 1.0) > CLEARLY * turning.scale_std:
+            slip = f": it turns {_format_factor(turning)} times as far, as wheels do that slip"
+        yield (
+            f"The gyro contradicts odometry {differ}{slip}. The model was learnt from the wheels' "
+            f"displacements along the heading of the gyro, whose {bias}."
+        )
+        return
+    times = f"{_format_factor(turning)} times as far"
+    if recording.measured_by == "":
+        yield (
+            f"The gyro contradicts the pose {differ}: the pose turns {times}. If it is odometry, "
+            "write `measured_by: odometry` below `pose:`, and the gyro will turn it."
+        )
+        return
+    yield (
+        f"The gyro contradicts the tracker {differ}: the tracker turns {times}; check the gyro's "
+        "scale and mounting."
+    )
+
+
+def _format_factor(turning: Turning) -> str:
+    digits = max(2, int(np.ceil(-np.log10(max(turning.scale_std, 1e-4)))))
+    return f"{turning.scale:.{digits}f} +- {turning.scale_std:.1g}"

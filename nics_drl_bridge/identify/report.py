@@ -1,24 +1,34 @@
 """Fit report: the model's equations, the quality of its fit, and what could not be learnt."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
+from math import isfinite
 from textwrap import fill
+from typing import NamedTuple
 
 import numpy as np
 
-from nics_drl_bridge.identify.conclusion import conclude
-from nics_drl_bridge.identify.fit import Alpha
+from nics_drl_bridge.identify.fit import Alpha, describe_narrow_commands
 from nics_drl_bridge.identify.hypotheses import PRUNING, list_candidates
 from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.identify.judgement import (
+    Verdict,
+    list_doubts_of_commands,
+    select_usual_horizon,
+)
+from nics_drl_bridge.identify.repair import describe_reference
 from nics_drl_bridge.identify.signals import select_moved_commands
 from nics_drl_bridge.identify.statistics import Curve
 from nics_drl_bridge.identify.verdict import (
     FAR_OFF,
+    Alone,
     Doubt,
     Mistake,
     describe_coarsest_state,
+    list_missed,
 )
+from nics_drl_bridge.robot.kinds import describe_overdrive
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 
@@ -154,43 +164,60 @@ def list_motor_effects(identified: Identified) -> Iterator[str]:
     The names are `throttle.dead`, `.least`, `.most`, `.back` and `.delay` for a command, `vx.fall`,
     `.rise`, `.friction` and `.drag` for a state, and `vx.back_emf.throttle` for a pair.
     """
-    model = identified.model
     sigma = identified.calibration.uncertainty
     units = list_units(identified.drive.spec)
-    # name, parameter, description, value, unit, and the value that means "no effect"
-    rows: list[tuple[str, str, str, float, str, float]] = []
+    effects = (
+        *_list_curve_effects(identified.model, units),
+        *_list_state_effects(identified.model),
+    )
+    for name, parameter, words, value, unit, usual in effects:
+        if value == usual:
+            continue
+        error = sigma.get(f"{name}.{parameter}")
+        spread = "" if error is None else f" +- {error:.2g}"
+        yield f"{name:<24} {words}: {value:.4g}{spread} {unit}".rstrip()
+
+
+# name, parameter, description, value, unit, and the value that means "no effect"
+Effect = tuple[str, str, str, float, str, float]
+
+
+def _list_curve_effects(model: TaylorModel, units: Mapping[str, str]) -> list[Effect]:
+    """Lists the parameters of the input curves."""
+    effects: list[Effect] = []
+    back = "reverse gain, relative to forward"
     for curve in model.inputs:
         name = curve.command
         unit = units[name]
         dead = DEAD_ZONE if curve.dead > 0.0 else EAGER
-        back = "reverse gain, relative to forward"
-        rows += [
+        effects += [
             (name, "dead", dead, curve.dead, unit, 0.0),
             (name, "least", "saturates below", curve.least, unit, -np.inf),
             (name, "most", "saturates above", curve.most, unit, np.inf),
             (name, "back", back, curve.back, "", 1.0),
             (name, "delay", "delay after the common latency", curve.delay, "s", 0.0),
         ]
-    actuators = model.limits, model.friction, model.drag
-    rates = zip(model.variables, model.dof_units[3:], *actuators, strict=False)
-    for state, unit, (fall, rise), friction, drag in rates:
-        rows += [
+    return effects
+
+
+def _list_state_effects(model: TaylorModel) -> list[Effect]:
+    """Lists the limits, friction, drag and back-EMF of the states."""
+    effects: list[Effect] = []
+    commands = model.variables[model.state_size :]
+    for i, state in enumerate(model.variables[: model.state_size]):
+        unit = model.dof_units[3 + i]
+        fall, rise = model.limits[i].tolist()
+        friction = float(model.friction[i])
+        effects += [
             (state, "fall", "maximum fall", fall, unit, -np.inf),
             (state, "rise", "maximum rise", rise, unit, np.inf),
             (state, "friction", "dry friction", friction, unit, 0.0),
-            (state, "drag", "drag, times its square", drag, "", 0.0),
+            (state, "drag", "drag, times its square", float(model.drag[i]), "", 0.0),
         ]
-    commands = model.variables[model.state_size :]
-    for state, emf in zip(model.variables, model.back_emf.tolist(), strict=False):
-        for command, value in zip(commands, emf, strict=True):
+        for command, value in zip(commands, model.back_emf[i].tolist(), strict=True):
             words = f"back-EMF, times {state} and |{command}|"
-            rows.append((state, f"back_emf.{command}", words, value, "", 0.0))
-    for name, parameter, words, value, unit, usual in rows:
-        if value == usual:
-            continue
-        error = sigma.get(f"{name}.{parameter}")
-        spread = "" if error is None else f" +- {error:.2g}"
-        yield f"{name:<24} {words}: {value:.4g}{spread} {unit}".rstrip()
+            effects.append((state, f"back_emf.{command}", words, value, "", 0.0))
+    return effects
 
 
 def format_with_error(value: float, error: float | None) -> str:
@@ -356,24 +383,60 @@ class CalibratedValue:
 
 def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
     """Returns all estimates of the calibration by their names in `Calibration`."""
-    recording = identified.recording
     calibration = identified.calibration
     sigma = calibration.uncertainty
+    replaced = bool(identified.findings.replacement)
+    values = {}
+    for key, (name, value, unit, why) in _list_estimates(identified).items():
+        if replaced and key in TEXTBOOK_VALUES:
+            known = CalibratedValue(name, value, None, unit, "by the fitted textbook")
+        elif key in sigma:
+            is_zero = value == 0.0 and key in MOUNTING_VALUES
+            remark = "below its uncertainty: taken as zero" if is_zero else ""
+            known = CalibratedValue(name, value, sigma[key], unit, remark)
+        else:
+            known = CalibratedValue(name, None, None, unit, why)
+        values[key] = known
+    period = calibration.burst_period_s
+    if period > 0.0:
+        values["burst_period_s"] = replace(
+            values["burst_period_s"], value=period, remark=""
+        )
+    swapped = calibration.wheels_swapped
+    if swapped is not None:
+        meaning = "left and right are interchanged" if swapped else "as named"
+        values["wheels_swapped"] = replace(
+            values["wheels_swapped"], value=float(swapped), remark=meaning
+        )
+    return values
+
+
+def _list_estimates(
+    identified: Identified,
+) -> dict[str, tuple[str, float | None, str, str]]:
+    """Returns name, value, unit, and why it may be unknown, of each estimate."""
+    recording = identified.recording
+    calibration = identified.calibration
     mounting = identified.findings.mounting
     one_clock = recording.pose.clock == recording.command.clock
     changed = bool(select_moved_commands(recording.command).any())
     untold = "the motion does not show it" if changed else "no command changed"
     clocks = "pose and commands are on one clock" if one_clock else untold
-    both = "clock_offset_s" in sigma
-    latency = "only its sum with the clock offset is known" if both else untold
-    if identified.findings.motion_width_s is not None and not both:
+    latency = untold
+    if "clock_offset_s" in calibration.uncertainty:
+        latency = "only its sum with the clock offset is known"
+    elif identified.findings.motion_width_s is not None:
         latency = "it can't be separated from the lags"
     few = "the drive shows too few directions of motion"
-    hidden = (few, few) if mounting is None else mounting.hidden
-    unknown = recording.wheels is None
-    wheels = "no wheel speeds were recorded" if unknown else "the wheels do not show it"
+    x_why, y_why = (few, few) if mounting is None else mounting.hidden
+    wheels = "the wheels do not show it"
+    if recording.wheels is None:
+        wheels = "no wheel speeds were recorded"
+    x, y = calibration.lever_arm_m
+    speed_unit = "m/s per unit"
+    turn_unit = "rad/s per unit"
     singly = "the poses are stamped one by one"
-    rows = {
+    return {
         "clock_offset_s": ("clock offset", calibration.clock_offset_s, "s", clocks),
         "command_latency_s": (
             "command latency",
@@ -383,38 +446,12 @@ def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
         ),
         "burst_period_s": ("period of bursts", None, "s", singly),
         "rotation_rad": ("rotation of base_link", calibration.rotation_rad, "rad", few),
-        "lever_arm_x_m": ("lever arm x", calibration.lever_arm_m[0], "m", hidden[0]),
-        "lever_arm_y_m": ("lever arm y", calibration.lever_arm_m[1], "m", hidden[1]),
-        "wheel_scale": ("wheel scale", calibration.wheel_scale, "m/s per unit", wheels),
-        "turn_scale": ("turn scale", calibration.turn_scale, "rad/s per unit", wheels),
+        "lever_arm_x_m": ("lever arm x", x, "m", x_why),
+        "lever_arm_y_m": ("lever arm y", y, "m", y_why),
+        "wheel_scale": ("wheel scale", calibration.wheel_scale, speed_unit, wheels),
+        "turn_scale": ("turn scale", calibration.turn_scale, turn_unit, wheels),
+        "wheels_swapped": ("swapped wheels", None, "", wheels),
     }
-    values = {}
-    for key, (name, value, unit, why) in rows.items():
-        values[key] = CalibratedValue(name, None, None, unit, why)
-        if key in sigma:
-            is_zero = value == 0.0 and key in MOUNTING_VALUES
-            remark = "below its uncertainty: taken as zero" if is_zero else ""
-            values[key] = CalibratedValue(name, value, sigma[key], unit, remark)
-    if identified.findings.replacement:
-        for key in TEXTBOOK_VALUES:
-            name, value, unit, _ = rows[key]
-            values[key] = CalibratedValue(
-                name, value, None, unit, "by the fitted textbook"
-            )
-    period = calibration.burst_period_s
-    if period > 0.0:
-        values["burst_period_s"] = CalibratedValue(
-            "period of bursts", period, None, "s"
-        )
-    value = None
-    meaning = wheels
-    if calibration.wheels_swapped is not None:
-        value = float(calibration.wheels_swapped)
-        meaning = "left and right are interchanged" if value else "as named"
-    values["wheels_swapped"] = CalibratedValue(
-        "swapped wheels", value, None, "", meaning
-    )
-    return values
 
 
 def is_useless(error: float, standing: float, path: float, radius: float) -> bool:
@@ -464,3 +501,118 @@ def _name_suspect(identified: Identified, spec: RobotSpec) -> str:
     got = "that nothing blocked the robot, that it received each command"
     shown = f"{got} and that rows {apart} show how it responds"
     return f"the recording does not show why, so make sure {shown}, and record again."
+
+
+# duration of a drive above which errors have other causes than its length
+ENOUGH_S = 60.0
+UNSEEN = "otherwise a policy would rely on motion the model never saw"
+UNTRIED = "The drive was too short to test the model on unseen data."
+
+
+class Conclusion(NamedTuple):
+    """Sentences that sum up a fit."""
+
+    verdict: Verdict
+    accuracy: str
+    doubts: tuple[str, ...]  # reasons not to trust it
+    gaps: tuple[str, ...]  # what the drive could not teach
+    advice: str  # the recommended next step
+    ready: bool  # False if another drive or mapping should come before a policy
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """All sentences, in reading order."""
+        first = f"Verdict: {self.verdict}. {self.accuracy}"
+        return (first, *self.doubts, *self.gaps, self.advice)
+
+
+def conclude(identified: Identified) -> Conclusion:
+    """Draws the conclusion of a fit."""
+    spec = identified.drive.spec
+    assessment = identified.assessment
+    wrong = tuple(str(note) for note in identified.notes if isinstance(note, Mistake))
+    strange = tuple(str(note) for note in identified.notes if isinstance(note, Doubt))
+    replaced = identified.findings.replacement
+    doubts = (
+        *wrong,
+        *strange,
+        *(str(note) for note in identified.notes if isinstance(note, Alone)),
+        *((replaced,) if replaced else ()),
+        *list_doubts_of_commands(identified.judgement, identified.calibration),
+        *assessment.reasons,
+    )
+    overdrive = describe_overdrive(spec)
+    gaps = (
+        *identified.gaps,
+        *describe_narrow_commands(identified.recording, spec),
+        *((overdrive,) if overdrive else ()),
+    )
+    ready = (
+        assessment.verdict is not Verdict.DO_NOT_TRAIN and not identified.model.assumed
+    )
+    advice = (
+        f"Next: {_choose_advice(identified, bool(wrong), bool(strange), bool(gaps))}."
+    )
+    errors = (
+        f"{accuracy(identified)} {describe_reference(identified.recording)}".strip()
+    )
+    return Conclusion(assessment.verdict, errors, doubts, gaps, advice, ready)
+
+
+def _choose_advice(
+    identified: Identified, mistaken: bool, strange: bool, gaps: bool
+) -> str:
+    """Returns the next step, by the first condition that is not met."""
+    duration = identified.drive.duration_s
+    if mistaken:
+        return "fix the mapping as described above, or the robot's own driver, and generate again"
+    if list_missed(identified.fit, identified.drive.spec) or identified.model.assumed:
+        return f"record another drive as described above; {UNSEEN}"
+    if not identified.judgement:
+        return f"record a longer drive than these {duration:.0f} s, best 60 s, and generate again"
+    if strange and identified.verdict is Verdict.WITH_CARE:
+        return "check what looks mistaken above; if the robot really behaves so, train a policy"
+    first = ", or first fix the points above" if gaps else ""
+    if identified.verdict is Verdict.GOOD:
+        return f"train a policy in the simulator{first}"
+    if identified.verdict is Verdict.WITH_CARE:
+        wide = (
+            "under a randomisation as wide as this error, and drive it slowly at first"
+        )
+        return f"train a policy {wide}{first}"
+    if duration < ENOUGH_S:
+        return f"record another drive, longer than these {duration:.0f} s, and generate again"
+    look = "see in report.html where the predicted paths leave the measured ones"
+    return f"{look}, fix the cause or record another drive, and generate again before training"
+
+
+def accuracy(identified: Identified) -> str:
+    """Formats how far off predictions of unseen data are, compared with the yardsticks'."""
+    for at in select_usual_horizon(identified.judgement):
+        if not isfinite(at.model.position_m):
+            return f"On unseen data the predictions diverge within {at.horizon_s:g} s."
+        yardsticks = {"a fitted textbook": at.textbook, "constant twist": at.kept_twist}
+        beside = [
+            f"{name} {format_error(errors, at.path_m)}"
+            for name, errors in yardsticks.items()
+            if errors is not None
+        ]
+        finding = f"On unseen data the predictions end {at.model.position_m:.3g} m off"
+        share = ""
+        if at.path_m > 0.0:
+            share = f" ({format_error(at.model, at.path_m)} of the path)"
+        return f"{finding} after {at.horizon_s:g} s{share}; {', '.join(beside)}."
+    return UNTRIED
+
+
+def is_share(errors: EndErrors, path: float) -> bool:
+    """True if `format_error` states a fraction of the path [m]."""
+    return path > 0.0 and isfinite(errors.position_m)
+
+
+def format_error(errors: EndErrors, path: float) -> str:
+    """Formats a position error as a fraction of the path [m], or in metres without a path."""
+    if not is_share(errors, path):
+        return f"{errors.position_m:.3g} m"
+    percentage = 100.0 * errors.position_m / path
+    return f"{percentage:.1f} %" if percentage >= 0.1 else "< 0.1 %"

@@ -24,13 +24,14 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.intp]
-# commands in effect (T, C) during each step, by values (I,)
-Commands = Callable[[Array], Array]
-# a model with friction and limits, by values
-Shape = Callable[[TaylorModel, Array], TaylorModel]
-# states (T, S) that follow the commands, by values (I,)
-States = Callable[[Array], Array]
-
+# values of parameters, by name
+Values = dict[str, float]
+# commands in effect (T, C) during each step
+Commands = Callable[[Values], Array]
+# a model with lags, friction and limits
+Shape = Callable[[TaylorModel, Values], TaylorModel]
+# states (T, S) that follow the commands
+States = Callable[[Values], Array]
 # weights of motions from start to end, usually 1
 Trust = Callable[[Array, Array], Array]
 
@@ -57,12 +58,12 @@ SAME_STEP = 0.01  # fraction of a step by which two steps may differ
 class Parameters:
     """Parameters of a model besides its coefficients, such as a delay, and their bounds.
 
-    A name is `latency`, a part of the mounting, or that of a command or state and of its part, such
-    as `throttle.delay` [s], `vx.lag` [s], `vx.gain`, `vx.rise` and `vx.fall` (limits) or
-    `throttle.dead`; `forms.list_parameters` lists them. The mounting comes last.
+    A name is `latency`, a part of the mounting (`x`, `y` and `heading`), or a command or state with
+    one of its parameters, such as `throttle.delay` [s], `throttle.dead`, `vx.lag` [s], `vx.gain`,
+    or `vx.rise` and `vx.fall` (limits). `forms.list_parameters` lists them.
     """
 
-    names: tuple[str, ...]  # of the values
+    names: tuple[str, ...]
     start: Array  # (I,)
     scale: Array  # (I,)
     low: Array  # (I,)
@@ -72,6 +73,14 @@ class Parameters:
     def sought(self) -> Rows:
         """Indices of the unknown values."""
         return np.flatnonzero(self.high > self.low)
+
+    def name(self, values: Array) -> Values:
+        """Returns values (I,) by name."""
+        return dict(zip(self.names, values.tolist(), strict=True))
+
+    def freeze(self) -> "Parameters":
+        """Returns the same parameters, known to have their start values."""
+        return replace(self, low=self.start, high=self.start)
 
     def shift_stamps(self, latency_s: float) -> "Parameters":
         """Returns the same delays relative to stamps that are later by a time [s]."""
@@ -86,28 +95,23 @@ class Parameters:
 
     def start_from(self, other: "Parameters") -> "Parameters":
         """Starts from the values of other parameters, where these have them."""
-        values = dict(zip(other.names, other.start.tolist(), strict=True))
-        start = [
-            values.get(name, at)
-            for name, at in zip(self.names, self.start, strict=True)
-        ]
+        values = self.name(self.start) | other.name(other.start)
+        start = [values[name] for name in self.names]
         return replace(self, start=np.clip(start, self.low, self.high))
 
 
 @dataclass(frozen=True)
 class Shooting:
-    """A prediction problem: a drive on one time axis, and its commands."""
+    """A prediction problem: a drive on one time axis, and the parameters that explain it."""
 
     samples: Samples
+    parameters: Parameters
     commands: Commands
     shape: Shape
     trust: Trust
     # of states that were not measured; None if the samples have the states
     inferred: States | None = None
-    # True if the last three values are the pose of the body that `q` describes, in the base
-    mounted: bool = False
     noise_m: float = 0.0  # standard deviation of measured positions
-    fixed: Array | None = None  # (I,) values that override those given
     horizons: tuple[float, ...] = HORIZONS_S
     spacing_s: float = SPACING_S
 
@@ -134,6 +138,11 @@ class Shooting:
             whole &= outside[end] == outside[first][:, None]
         is_used = whole.any(axis=1)
         return first[is_used], np.where(whole, steps, 0)[is_used]
+
+    @property
+    def is_mounted(self) -> bool:
+        """True if the parameters have the pose of the tracked body in the base."""
+        return "heading" in self.parameters.names
 
     @property
     def longest_horizon_s(self) -> float:
@@ -163,16 +172,14 @@ class Shooting:
         free: Mask | None = None,
     ) -> tuple[Array, Array]:
         """Returns poses (W, H, 3), derivatives (W, H, 3, P) by the `free` (D, K) coefficients."""
-        values = values if self.fixed is None else self.fixed
-        model = self.shape(model, values)
-        state = (
-            self.samples.q[:, 3:] if self.inferred is None else self.inferred(values)
-        )
+        at = self.parameters.name(values)
+        model = self.shape(model, at)
+        state = self.samples.q[:, 3:] if self.inferred is None else self.inferred(at)
         if free is None:
             free = np.zeros(model.coefficients.shape, dtype=np.bool_)
         used = (model.coefficients != 0.0) | free
         terms, moving = make_used_terms(model, used, free)
-        command = self.commands(values)
+        command = self.commands(at)
         shot = Shot(
             np.ascontiguousarray(state[first]),
             first,
@@ -183,17 +190,17 @@ class Shooting:
         )
         sizes = state.shape[1], command.shape[1], len(terms.dof), len(moving)
         shoot(shot, terms, moving, model.dt, tangent(*sizes))
-        return (
-            _mount_poses(values[-3:], shot) if self.mounted else (shot.end, shot.slope)
-        )
+        if self.is_mounted:
+            return _mount_poses(np.array([at["x"], at["y"], at["heading"]]), shot)
+        return shot.end, shot.slope
 
     def resample(self, values: Array) -> Samples:
         """Returns the samples with the commands in effect, and with inferred states."""
         if self.inferred is None:
             return self.samples
-        values = values if self.fixed is None else self.fixed
-        state = self.inferred(values)
-        x = np.concatenate([state, self.commands(values)], axis=1)
+        at = self.parameters.name(values)
+        state = self.inferred(at)
+        x = np.concatenate([state, self.commands(at)], axis=1)
         return put_states(replace(self.samples, x=x), state)
 
     def errors(
@@ -211,6 +218,11 @@ class Shooting:
         error[np.isnan(error)] = np.inf
         error[steps == 0] = np.nan
         return error, np.where(steps > 0, self.measure_paths(first, steps), np.nan)
+
+    def measure_mean_error(self, model: TaylorModel, values: Array) -> float:
+        """Returns the mean distance of predicted from measured ends, over all horizons [m]."""
+        error, _ = self.errors(model, values)
+        return float(np.nanmean(np.hypot(error[..., 0], error[..., 1])))
 
 
 def _mount_poses(mounting: Array, shot: Shot) -> tuple[Array, Array]:
@@ -234,50 +246,48 @@ class Predictive:
     """A model fitted to predictions."""
 
     model: TaylorModel
+    names: tuple[str, ...]  # of the parameters
     values: Array  # (I,) of the parameters
-    jacobian: Array  # (n, P) of the residual by the free coefficients
     residual: Array  # (n,) scaled errors [m/s]
-    free: Mask  # (D, K)
-    starts: Array  # (n,) start of the window of each residual [s]
     # (I, I) covariance of the values; NaN for known ones
     value_covariance: Array
+    coefficient_errors: Array  # (D, K) standard errors; NaN for known coefficients
 
     @property
-    def value_errors(self) -> Array:
-        """Standard errors (I,) of the values; NaN for known ones."""
-        return np.asarray(np.sqrt(np.maximum(np.diag(self.value_covariance), 0.0)))
+    def named(self) -> Values:
+        """Values of the parameters, by name."""
+        return dict(zip(self.names, self.values.tolist(), strict=True))
 
-    def named_errors(self, names: tuple[str, ...]) -> dict[str, float]:
-        """Returns the errors of values that belong to a command or state, such as `throttle.dead`.
+    @property
+    def errors(self) -> Values:
+        """Standard errors of the parameters, by name; NaN for known ones."""
+        errors = np.sqrt(np.maximum(np.diag(self.value_covariance), 0.0))
+        return dict(zip(self.names, errors.tolist(), strict=True))
 
-        Values that do not affect the predictions are left out.
+    @property
+    def shown_errors(self) -> Values:
+        """Errors of the parameters of commands and states, such as `throttle.dead`.
+
+        Parameters that do not affect the predictions are left out.
         """
-        errors = zip(names, self.value_errors.tolist(), strict=True)
-        return {
-            name: error for name, error in errors if "." in name and error > NO_ERROR
-        }
-
-
-NO_PARAMETERS = Parameters((), *(np.zeros(0) for _ in range(4)))
+        errors = self.errors.items()
+        return {name: e for name, e in errors if "." in name and e > NO_ERROR}
 
 
 def fit_to_predictions(
     problem: Shooting,
     model: TaylorModel,
     free: Mask,
-    parameters: Parameters,
     inside: Mask | None = None,
     evaluations: int = EVALUATIONS,
     pull: float = PULL,
     first: Array | None = None,
 ) -> Predictive:
-    """Adjusts free coefficients (D, K) and input values to minimise the prediction errors.
+    """Adjusts free coefficients (D, K) and unknown parameters to minimise the prediction errors.
 
     Coefficients are pulled towards the model's. The search starts at `first` if that is better.
     """
-    return _Search(problem, model, free, parameters, inside, pull).run(
-        first, evaluations
-    )
+    return _Search(problem, model, free, inside, pull).run(first, evaluations)
 
 
 class _Search:
@@ -288,14 +298,13 @@ class _Search:
         problem: Shooting,
         model: TaylorModel,
         free: Mask,
-        parameters: Parameters,
         inside: Mask | None,
         pull: float,
     ) -> None:
         self.problem = problem
         self.model = model
         self.free = free
-        self.parameters = parameters
+        self.parameters = problem.parameters
         size = np.sqrt(
             (taylor.evaluate(problem.samples.x, model.powers) ** 2).mean(axis=0)
         )
@@ -312,7 +321,7 @@ class _Search:
         )
         self.weight = weight / usual[:, None] * np.sqrt(trust)
         self.measured = problem.measure_motion(self.first, self.steps)
-        self.sought = parameters.sought
+        self.sought = self.parameters.sought
         self.count = len(self.sought)
         self.pull = REFERENCE_M_S * np.sqrt(pull * 3 * np.count_nonzero(self.wanted))
 
@@ -322,7 +331,7 @@ class _Search:
         coefficients[self.free] += theta[self.count :] * self.unit
         values = self.parameters.start.copy()
         values[self.sought] += self.parameters.scale[self.sought] * theta[: self.count]
-        values = values if self.problem.fixed is None else self.problem.fixed
+        values = np.maximum(values, self.parameters.low)  # rounding could pass it
         return replace(self.model, coefficients=coefficients), values
 
     def shot(self, theta: Array, sloped: bool) -> tuple[Array, Array]:
@@ -399,21 +408,21 @@ class _Search:
     def predictive(self, theta: Array) -> Predictive:
         """Returns the model with the data for its uncertainty."""
         best, values = self.at(theta)
-        best = self.problem.shape(best, values)
-        rest, slope = self.shot(theta, True)
-        slope = np.clip(np.nan_to_num(slope), -STEEPEST, STEEPEST)
-        starts = np.repeat(
-            self.problem.samples.t[self.first], 3 * self.wanted.sum(axis=1)
-        )
+        best = self.problem.shape(best, self.parameters.name(values))
+        rest = self.shot(theta, False)[0]
+        starts = self.problem.samples.t[self.first]
+        starts = np.repeat(starts, 3 * self.wanted.sum(axis=1))
         span = np.floor(starts / max(self.problem.horizons)).astype(np.intp)
-        size = len(self.parameters.start)
+        prior = np.append(np.zeros(self.count), np.full(len(self.unit), self.pull))
+        slopes = self.jacobian(theta)[: len(rest)]
+        scale = np.append(self.parameters.scale[self.sought], self.unit)
+        joint = estimate_clustered_covariance(slopes, rest, span, prior**2)
+        joint = joint * np.outer(scale, scale)
+        size = len(values)
         covariance = np.full((size, size), np.nan)
-        if self.count:
-            by_values = self.differentiate_by_values(theta, rest)
-            both = np.concatenate([by_values, slope * self.unit], axis=1)
-            prior = np.append(np.zeros(self.count), np.full(len(self.unit), self.pull))
-            joint = estimate_clustered_covariance(both, rest, span, prior**2)
-            scale = self.parameters.scale[self.sought]
-            known = joint[: self.count, : self.count] * np.outer(scale, scale)
-            covariance[np.ix_(self.sought, self.sought)] = known
-        return Predictive(best, values, slope, rest, self.free, starts, covariance)
+        covariance[np.ix_(self.sought, self.sought)] = joint[: self.count, : self.count]
+        errors = np.full(self.free.shape, np.nan)
+        variances = np.diag(joint)[self.count :]
+        errors[self.free] = np.sqrt(np.maximum(variances, 0.0))
+        names = self.parameters.names
+        return Predictive(best, names, values, rest, covariance, errors)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy  # its parts load slowly, when used
@@ -52,18 +51,13 @@ def minimise(
     start: Array,
     scale: Array,
     bounds: tuple[Array, Array],
-    jacobian: Callable[[Array], Array] | None = None,
 ) -> tuple[Array, Array, Array]:
     """Minimises a residual (n,) within bounds (P,); returns minimum, Jacobian (n, P), residual."""
-    low, high = bounds
-    slope: Any = "2-point"
-    if jacobian is not None:
-        slope = lambda z: jacobian(start + (z - 1.0) * scale) * scale  # noqa: E731
+    low, high = ((bound - start) / scale + 1.0 for bound in bounds)
     solution = scipy.optimize.least_squares(
         lambda z: residual(start + (z - 1.0) * scale),
         np.ones(len(start)),
-        jac=slope,
-        bounds=((low - start) / scale + 1.0, (high - start) / scale + 1.0),
+        bounds=(low, high),
         diff_step=DIFFERENCE,
         xtol=TOLERANCE,
         ftol=TOLERANCE,

@@ -26,8 +26,18 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify import excitation
-from nics_drl_bridge.identify.fit import ORDER, Alpha, Fit, prune_and_refit, regress
+from nics_drl_bridge.identify.fit import (
+    ORDER,
+    STILL,
+    TOGETHER,
+    Alpha,
+    Fit,
+    find_constant_combinations,
+    list_unmoved_variables,
+    prune_and_refit,
+    regress,
+    select_twist_terms,
+)
 from nics_drl_bridge.identify.signals import find_speed_index
 from nics_drl_bridge.identify.yardstick import probe_structure
 from nics_drl_bridge.recording.recording import Samples
@@ -97,13 +107,18 @@ class Library:
         )
         if not (self.spec.moves_sideways or slips_sideways):
             coefficients[VY] = 0.0
-        speed = find_speed_index(self.spec)
-        if self.kind is Kind.FOLLOWER and speed is not None:
-            alone = np.eye(len(model.variables), dtype=np.int64)[speed]
-            is_speed = (model.powers == alone).all(axis=1)
-            if (coefficients[VX, is_speed] > 0.0).any():
-                coefficients[VX, is_speed] = 1.0
+        is_speed = self._select_inferred_speed(model)
+        if (coefficients[VX, is_speed] > 0.0).any():
+            coefficients[VX, is_speed] = 1.0
         return replace(model, coefficients=coefficients)
+
+    def _select_inferred_speed(self, model: TaylorModel) -> Mask:
+        """Selects the term (K,) of a speed alone that was not measured; none if it was."""
+        speed = find_speed_index(self.spec)
+        if self.kind is not Kind.FOLLOWER or speed is None:
+            return np.zeros(len(model.powers), dtype=np.bool_)
+        alone = np.eye(len(model.variables), dtype=np.int64)[speed]
+        return np.asarray((model.powers == alone).all(axis=1))
 
     def fit_base(self, samples: Samples, tyres: bool) -> TaylorModel:
         """Fits the base: the textbook's terms of a motion, else those up to its order."""
@@ -124,11 +139,8 @@ class Library:
         if self.kind is Kind.MOTION:
             return np.asarray(free & ~select_defined_dofs(self.spec)[:, None])
         free[FIRST_STATE:] = False
-        speed = find_speed_index(self.spec)
-        if self.kind is Kind.FOLLOWER and speed is not None:
-            alone = np.eye(len(model.variables), dtype=np.int64)[speed]
-            is_speed = (model.powers == alone).all(axis=1)
-            free[VX, is_speed & (model.coefficients[VX] == 1.0)] = False
+        is_speed = self._select_inferred_speed(model)
+        free[VX, is_speed & (model.coefficients[VX] == 1.0)] = False
         return np.asarray(free)
 
 
@@ -166,11 +178,11 @@ def fit_motion_terms(
 def _find_constant_variables(samples: Samples, spec: RobotSpec) -> dict[str, float]:
     """Returns the values of the variables that never moved, by name; 0 if close to it."""
     variables = (*spec.state, *spec.command)
-    unmoved = excitation.list_unmoved_variables(samples, spec)
+    unmoved = list_unmoved_variables(samples, spec)
     constants = {}
     for variable, mean in zip(variables, samples.x.mean(axis=0), strict=True):
         if variable.name in unmoved:
-            is_zero = abs(mean) <= excitation.STILL * (variable.max - variable.min)
+            is_zero = abs(mean) <= STILL * (variable.max - variable.min)
             constants[variable.name] = 0.0 if is_zero else float(mean)
     return constants
 
@@ -180,14 +192,12 @@ def _define_twist(
 ) -> TaylorModel:
     """Sets the rows of the twist that are states; a state that never moved is a constant there."""
     linear = np.eye(len(model.variables), dtype=np.int64)
-    constant = 0 * linear[0]
-    needed = [constant, *linear[: len(spec.state)]]
-    more = [row for row in needed if not (model.powers == row).all(axis=1).any()]
-    powers = np.concatenate(
-        [model.powers, np.reshape(more, (-1, len(linear))).astype(np.int64)]
+    constant = 0 * linear[:1]
+    model = add_terms(
+        model, np.concatenate([constant, linear[: len(spec.state)]], axis=0)
     )
-    coefficients = np.zeros((len(model.dofs), len(powers)))
-    coefficients[:, : len(model.powers)] = model.coefficients
+    powers = model.powers
+    coefficients = model.coefficients
     # remaining lateral motion is noise, unless it is a state
     if not spec.moves_sideways:
         coefficients[VY] = 0.0
@@ -200,14 +210,7 @@ def _define_twist(
         else:
             row = value * (powers == constant).all(axis=1)
         coefficients[POSE_RATES.index(variable.twist)] = row
-    kept = coefficients.any(axis=0)
-    return replace(
-        model,
-        powers=powers[kept],
-        coefficients=coefficients[:, kept],
-        std_errors=np.zeros((0, 0)),
-        bounded=True,
-    )
+    return replace(drop_unused_terms(model), bounded=True)
 
 
 def select_motion_terms(
@@ -333,7 +336,7 @@ def select_terms_through_state(
         name for name, most in zip(names, powers.max(axis=0), strict=True) if most == 0
     )
     allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
-    allowed[TWIST] = excitation.select_twist_terms(powers, spec, unmoved)
+    allowed[TWIST] = select_twist_terms(powers, spec, unmoved)
     if by_book:
         allowed[TWIST] &= _select_textbook_twist(powers, spec)
     if reversed_names is not None and centred:
@@ -364,6 +367,23 @@ def _expand_textbook_twist(spec: RobotSpec) -> tuple[tuple[Array, ...], ...]:
 
     A trim, a wheel that steers a little to one side, leaves an angle out of a term.
     """
+    commands = np.zeros(len(spec.command), dtype=np.int64)
+    alone = np.eye(len(spec.state), dtype=np.int64)
+    expansions = []
+    for terms in _expand_twist_by_state(spec):
+        trims = [
+            term - alone[factor]
+            for term in terms
+            for factor in np.flatnonzero(term)
+            if spec.state[factor].unit == "rad"
+        ]
+        both = (*terms, *trims)
+        expansions.append(tuple(np.append(term, commands) for term in both))
+    return tuple(expansions)
+
+
+def _expand_twist_by_state(spec: RobotSpec) -> list[Powers]:
+    """Returns the terms (K, S) of the expanded twist of a textbook, by part."""
     count = len(spec.state)
     powers = list_exponents(count, MAX_ORDER)
     rng = np.random.default_rng(0)
@@ -376,19 +396,8 @@ def _expand_textbook_twist(spec: RobotSpec) -> tuple[tuple[Array, ...], ...]:
         effect = np.linalg.lstsq(chi / size, twist, rcond=None)[0].T
     except ConfigError:
         effect = np.tile((powers.sum(axis=1) <= ORDER) * 1.0, (3, 1))
-    commands = np.zeros(len(spec.command), dtype=np.int64)
-    expansions = []
-    for part in np.abs(effect):
-        terms = powers[part > max(VISIBLE * part.max(), NOTHING)]
-        trims = [
-            term - np.eye(count, dtype=np.int64)[factor]
-            for term in terms
-            for factor in np.flatnonzero(term)
-            if spec.state[factor].unit == "rad"
-        ]
-        both = (*terms, *trims)
-        expansions.append(tuple(np.append(term, commands) for term in both))
-    return tuple(expansions)
+    parts = np.abs(effect)
+    return [powers[part > max(VISIBLE * part.max(), NOTHING)] for part in parts]
 
 
 def find_followed_command(spec: RobotSpec, variable: StateVariable) -> int:
@@ -464,18 +473,23 @@ def share_effects(model: TaylorModel, spec: RobotSpec, samples: Samples) -> Tayl
     Uses the minimum-norm coefficients, for example for four wheels and three degrees of freedom:
     commands u are replaced by P u, where P projects out the combinations that stayed constant.
     """
-    combinations = excitation.find_constant_combinations(samples, spec)
+    combinations = find_constant_combinations(samples, spec)
     command = samples.x[:, len(spec.state) :]
     is_part = np.abs(combinations).max(axis=0, initial=0.0) > NOTHING
     parts = [c for c, part in zip(spec.command, is_part.tolist(), strict=True) if part]
     if len({c.unit for c in parts}) != 1:
         return model
     constant = combinations / np.maximum(command.std(axis=0), NOTHING)
-    if np.abs(constant @ command.mean(axis=0)).max() > excitation.TOGETHER:
+    if np.abs(constant @ command.mean(axis=0)).max() > TOGETHER:
         return model
     normal = scipy.linalg.orth(constant.T)
     projection = np.eye(len(model.variables))
     projection[len(spec.state) :, len(spec.state) :] -= normal @ normal.T
+    return _project_terms(model, projection)
+
+
+def _project_terms(model: TaylorModel, projection: Array) -> TaylorModel:
+    """Returns the terms of a model whose variables are projected (V, V) beforehand."""
     effects: dict[tuple[int, ...], Array] = {}
     columns = zip(model.powers.tolist(), model.coefficients.T, strict=True)
     for exponents, effect in columns:
@@ -525,18 +539,22 @@ def find_linear_term(model: TaylorModel, name: str) -> int:
     return int(np.flatnonzero((model.powers == alone).all(axis=1))[0])
 
 
-def add_linear_terms(model: TaylorModel) -> TaylorModel:
-    """Returns a model that has a term, maybe of zero, of each variable alone."""
-    linear = np.eye(len(model.variables), dtype=np.int64)
-    more = [row for row in linear if not (model.powers == row).all(axis=1).any()]
-    powers = np.concatenate(
-        [model.powers, np.reshape(more, (-1, len(linear))).astype(np.int64)]
-    )
+def add_terms(model: TaylorModel, more: Powers) -> TaylorModel:
+    """Returns a model that has these terms (K, V), too, maybe with a coefficient of zero."""
+    known = set(map(tuple, model.powers.tolist()))
+    new = [row for row in more.tolist() if tuple(row) not in known]
+    both = np.array([*model.powers.tolist(), *new], dtype=np.int64)
+    powers = both.reshape(-1, len(model.variables))
     coefficients = np.zeros((len(model.dofs), len(powers)))
     coefficients[:, : len(model.powers)] = model.coefficients
     return replace(
         model, powers=powers, coefficients=coefficients, std_errors=np.zeros((0, 0))
     )
+
+
+def add_linear_terms(model: TaylorModel) -> TaylorModel:
+    """Returns a model that has a term, maybe of zero, of each variable alone."""
+    return add_terms(model, np.eye(len(model.variables), dtype=np.int64))
 
 
 def drop_unused_terms(model: TaylorModel) -> TaylorModel:
@@ -553,16 +571,8 @@ def drop_unused_terms(model: TaylorModel) -> TaylorModel:
 
 def merge_terms(base: TaylorModel, other: TaylorModel) -> tuple[TaylorModel, Array]:
     """Returns a model over the terms of both, and the other's coefficients (D, K) for them."""
-    rows = {tuple(row): k for k, row in enumerate(other.powers.tolist())}
-    more = [row for row in base.powers.tolist() if tuple(row) not in rows]
-    rows |= {tuple(row): len(rows) + k for k, row in enumerate(more)}
-    powers = np.array(list(rows), dtype=np.int64)
-    size = (len(base.dofs), len(powers))
-    of_other = np.zeros(size)
-    of_other[:, : len(other.powers)] = other.coefficients
-    of_base = np.zeros(size)
-    of_base[:, [rows[tuple(row)] for row in base.powers.tolist()]] = base.coefficients
-    model = replace(
-        base, powers=powers, coefficients=of_base, std_errors=np.zeros((0, 0))
-    )
-    return model, of_other
+    model = add_terms(base, other.powers)
+    merged = add_terms(other, base.powers)
+    places = {tuple(row): k for k, row in enumerate(merged.powers.tolist())}
+    order = [places[tuple(row)] for row in model.powers.tolist()]
+    return model, merged.coefficients[:, order]

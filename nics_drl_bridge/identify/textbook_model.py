@@ -1,21 +1,27 @@
-"""A fitted textbook as a Taylor model, which replaces a model that predicts worse."""
+"""A fitted textbook as a Taylor model, and its terms for inputs that a drive did not move."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.calibration import Calibration, Response
+from nics_drl_bridge.identify.calibration import Calibration, Response, require_state
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.motion import require_state
-from nics_drl_bridge.identify.signals import infer_states
-from nics_drl_bridge.identify.yardstick import LIMIT_RANGE, TextbookResponse, Yardstick
+from nics_drl_bridge.identify.signals import infer_states, list_followed_commands
+from nics_drl_bridge.identify.verdict import Gap
+from nics_drl_bridge.identify.yardstick import (
+    LIMIT_RANGE,
+    TextbookResponse,
+    Yardstick,
+    probe_structure,
+)
 from nics_drl_bridge.recording.recording import Samples, Stream
 from nics_drl_bridge.robot.curve import InputCurve
-from nics_drl_bridge.robot.kinds import has_textbook, textbook
-from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
+from nics_drl_bridge.robot.kinds import Textbook, has_textbook, reach, textbook
+from nics_drl_bridge.robot.spec import POSE_RATES, CommandVariable, RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel, evaluate
 
 Powers = NDArray[np.int64]
@@ -63,20 +69,171 @@ def make_textbook_model(
     textbook relates to the twist.
     """
     response = yardstick.response
-    book = _Expansion(response, samples, spec, model)
-    if not spec.state:
-        book.add_twist_of_commands()
-    elif [v.name for v in spec.state] == ["wheel_speed", "wheel_angle"]:
-        book.add_actuators()
-    elif any(v.twist for v in spec.state):
-        book.add_twist_as_state()
-    elif all(v.follows for v in spec.state):
-        book.add_followers()
-    elif has_textbook(spec) and not response.bicycle.used:
-        book.add_wheels()
-    else:
+    relation = _relate_variables(response, samples.x, spec)
+    if relation is None:
         return None
-    return book.made()
+    states = samples.x[:, : len(spec.state)]
+    # A step of the model brings a state as close to its goal as the lag does.
+    share = -np.expm1(-model.dt / relation.lag_s)
+    rates = (relation.goal - states) * share / model.dt
+    targets = np.concatenate([relation.twist, rates], axis=1)
+    allowed = _list_terms(relation, samples.x.shape[1], len(targets.T))
+    pairs = zip(targets.T, allowed, strict=True)
+    terms = [_expand(samples.x, target, powers) for target, powers in pairs]
+    powers = np.unique(np.concatenate([rows for rows, _ in terms]), axis=0)
+    coefficients = np.zeros((len(terms), len(powers)))
+    for d, (rows, values) in enumerate(terms):
+        place = (powers == rows[:, None]).all(axis=2).argmax(axis=1)
+        coefficients[d, place] = values
+    limits = np.tile([-np.inf, np.inf], (len(spec.state), 1))
+    limits[relation.is_speed] = _find_speed_limits(response)
+    return TaylorModel(
+        spec.variable_names,
+        spec.dof_names,
+        spec.dof_units,
+        powers=powers,
+        coefficients=coefficients,
+        dt=model.dt,
+        low=samples.x.min(axis=0),
+        high=samples.x.max(axis=0),
+        bounded=model.bounded,
+        inputs=tuple(_find_dead_zones(response, spec)),
+        limits=limits,
+    )
+
+
+def _list_terms(relation: "_Relation", variables: int, dofs: int) -> list[Powers]:
+    """Returns the terms (K, V) that each degree of freedom may have: linear, but for a bicycle."""
+    linear = np.eye(variables, dtype=np.int64)
+    allowed = [np.concatenate([0 * linear[:1], linear])] * dofs
+    if relation.pair is not None:
+        v, steer = (linear[place] for place in relation.pair)
+        allowed[0] = np.array([v, v + 2 * steer])
+        turns = [v, v + steer, v + 2 * steer, v + 3 * steer]
+        allowed[2] = np.array([*turns, 2 * v, 2 * v + steer, 3 * v + steer])
+    return allowed
+
+
+def _expand(x: Array, target: Array, allowed: Powers) -> tuple[Powers, Array]:
+    """Returns the terms (K, V), and their coefficients, that approximate a target (T,) on rows."""
+    chi = evaluate(x, allowed)
+    size = np.maximum(np.linalg.norm(chi, axis=0), 1e-12)
+    beta = np.linalg.lstsq(chi / size, target, rcond=1e-9)[0]
+    shown = np.abs(beta) > NEGLIGIBLE * max(float(np.linalg.norm(target)), 1e-12)
+    beta = np.linalg.lstsq((chi / size)[:, shown], target, rcond=1e-9)[0]
+    return allowed[shown], beta / size[shown]
+
+
+class _Relation(NamedTuple):
+    """What a fitted textbook says of the variables of a robot, on the rows (T,) of a drive."""
+
+    twist: Array  # (T, 3)
+    goal: Array  # (T, S) to which commands lead the states
+    lag_s: Array  # (S,)
+    is_speed: NDArray[np.bool_]  # (S,) states whose acceleration is limited
+    # indices in X of speed and steering, by which a bicycle moves
+    pair: tuple[int, int] | None = None
+
+
+def _relate_variables(
+    response: TextbookResponse, x: Array, spec: RobotSpec
+) -> _Relation | None:
+    """Relates states and commands by a fitted textbook; None if it does not know the state."""
+    count = len(spec.state)
+    state = x[:, :count]
+    command = x[:, count:]
+    actuator = command @ response.gain.T
+    actuator[:, 2] += response.bicycle.used * response.offset[2]
+    if any(v.twist for v in spec.state):
+        return _relate_twist(response, state, actuator, spec)
+    if not count:
+        nothing = np.zeros(0, dtype=np.bool_)
+        pair = _find_bicycle_commands(response) if response.bicycle.used else None
+        twist = _find_twist(response, actuator)
+        return _Relation(twist, state, np.zeros(0), nothing, pair)
+    if [v.name for v in spec.state] == ["wheel_speed", "wheel_angle"]:
+        twist = _find_twist(response, np.insert(state, 1, 0.0, axis=1))
+        used = [0, 2]
+        is_speed = np.array([True, False])
+        return _Relation(
+            twist, actuator[:, used], response.lag_s[used], is_speed, (0, 1)
+        )
+    if all(v.follows for v in spec.state):
+        return _relate_followers(response, state, command, spec)
+    if has_textbook(spec) and not response.bicycle.used:
+        return _relate_wheels(response, state, command, spec)
+    return None
+
+
+def _relate_twist(
+    response: TextbookResponse, state: Array, actuator: Array, spec: RobotSpec
+) -> _Relation:
+    """Relates states that are components of the body twist; others stay as they are."""
+    parts = [POSE_RATES.index(v.twist) if v.twist else -1 for v in spec.state]
+    twist = np.zeros((len(state), 3))
+    goal = state.copy()
+    for i, part in enumerate(parts):
+        if part >= 0 and (part != 1 or spec.moves_sideways):
+            twist[:, part] = state[:, i]
+            goal[:, i] = actuator[:, part]
+    return _Relation(twist, goal, response.lag_s[parts], np.array(parts) == 0)
+
+
+def _relate_followers(
+    response: TextbookResponse, state: Array, command: Array, spec: RobotSpec
+) -> _Relation:
+    """Relates states that follow commands one by one."""
+    follow = list_followed_commands(spec).tolist()
+    pairs = [_find_actuator(response, place) for place in follow]
+    moved = [actuator for actuator, _ in pairs]
+    goal = command[:, follow] * [gain for _, gain in pairs]
+    actuator = np.zeros((len(state), 3))
+    actuator[:, moved] = state
+    pair = None
+    if response.bicycle.used:  # the state is the commanded angle
+        speed, steering = _find_bicycle_commands(response)
+        pair = follow.index(speed), follow.index(steering)
+        actuator[:, 2] *= response.gain[2, steering]
+        actuator[:, 2] += response.offset[2]
+    twist = _find_twist(response, actuator)
+    return _Relation(twist, goal, response.lag_s[moved], np.array(moved) == 0, pair)
+
+
+def _relate_wheels(
+    response: TextbookResponse, state: Array, command: Array, spec: RobotSpec
+) -> _Relation:
+    """Relates wheels, which follow the commands as the textbook says, by its fitted gains."""
+    book = textbook(spec)
+    count = len(spec.state)
+    per_command = book.target(np.eye(len(spec.command)))  # (C, S)
+    per_wheel = book.twist(np.eye(count))  # (S, 3)
+    steady = (per_command @ per_wheel).T  # (3, C)
+    power = np.maximum((steady**2).sum(axis=1), 1e-12)
+    times = (response.gain * steady).sum(axis=1) / power
+    lag = float(response.lag_s[response.gain.any(axis=1)].mean())
+    twist = state @ per_wheel * times
+    unlimited = np.zeros(count, dtype=np.bool_)
+    return _Relation(twist, command @ per_command, np.full(count, lag), unlimited)
+
+
+def _find_twist(response: TextbookResponse, actuator: Array) -> Array:
+    """Returns the body twist (T, 3) of actuators (T, 3): itself, or speed, 0 and angle."""
+    bicycle = response.bicycle
+    if not bicycle.used:
+        return actuator
+    speed = actuator[:, 0]
+    angle = np.clip(actuator[:, 2], -WIDEST_ANGLE, WIDEST_ANGLE)
+    length = bicycle.wheelbase * (1.0 + bicycle.understeer * speed**2)
+    along = speed * np.cos(angle) if bicycle.front_drive else speed
+    turn = along * np.tan(angle) / length
+    return np.stack([along, 0.0 * speed, turn], axis=1)
+
+
+def _find_speed_limits(response: TextbookResponse) -> tuple[float, float]:
+    """Returns the maximum fall and rise of the speed, infinite where none was found."""
+    rise, fall = map(float, response.limit)
+    most = UNLIMITED * LIMIT_RANGE[1]
+    return -fall if fall < most else -np.inf, rise if rise < most else np.inf
 
 
 def needs_actuators(yardstick: Yardstick, spec: RobotSpec) -> bool:
@@ -91,31 +248,13 @@ def make_actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
     speed, steering = _find_bicycle_commands(response)
     speed_gain = abs(float(response.gain[0, speed]))
     angle_gain = abs(float(response.gain[2, steering]))
-    largest = np.maximum(spec.command_high, -spec.command_low)
     forward = [v.twist for v in spec.state].index("vx")
-    fastest = np.abs(require_state(drive).values[:, forward]).max()
-    fastest = max(fastest, speed_gain * largest[speed])
-    if spec.command[speed].unit == "m/s":
-        fastest = max(fastest, largest[speed])
+    driven = np.abs(require_state(drive).values[:, forward]).max()
     sent = np.abs(drive.recording.command.values[:, steering]).max()
-    widest = angle_gain * sent + abs(response.offset[2])
-    widest = max(widest, angle_gain * largest[steering])
-    if spec.command[steering].unit == "rad":
-        widest = max(widest, largest[steering])
-    states = (
-        ("wheel_speed", "m/s", MARGIN * float(fastest), speed),
-        ("wheel_angle", "rad", MARGIN * float(widest), steering),
-    )
-    data = spec.model_dump()
-    data["state"] = [
-        {
-            "name": name,
-            "unit": unit,
-            "min": -reach,
-            "max": reach,
-            "follows": spec.command[place].name,
-        }
-        for name, unit, reach, place in states
+    turned = angle_gain * sent + abs(response.offset[2])
+    states = [
+        _make_actuator("wheel_speed", spec.command[speed], speed_gain, driven),
+        _make_actuator("wheel_angle", spec.command[steering], angle_gain, turned),
     ]
     parameters = {
         "speed_lag": float(response.lag_s[0]),
@@ -124,8 +263,23 @@ def make_actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
     # a car commanded by fractions of throttle and steering
     if "speed_gain" in spec.parameters:
         parameters |= {"speed_gain": speed_gain, "greatest_steering": angle_gain}
-    data["parameters"] = spec.parameters | parameters
+    parameters = spec.parameters | parameters
+    data = spec.model_dump() | {"state": states, "parameters": parameters}
     return RobotSpec.model_validate(data)
+
+
+def _make_actuator(
+    name: str, command: CommandVariable, gain: float, farthest: float
+) -> dict[str, object]:
+    """Returns a state that follows a command by a gain, and went as far as this on a drive."""
+    unit = "m/s" if name == "wheel_speed" else "rad"
+    largest = max(command.max, -command.min)
+    reach = max(farthest, gain * largest)
+    if command.unit == unit:
+        reach = max(reach, largest)
+    reach = MARGIN * float(reach)
+    limits = {"min": -reach, "max": reach}
+    return {"name": name, "unit": unit, "follows": command.name, **limits}
 
 
 def add_actuator_state(
@@ -187,194 +341,180 @@ def _find_dead_zones(
     yield InputCurve(command=spec.command[place].name, dead=dead)
 
 
-class _Expansion:
-    """Terms of a textbook, by degree of freedom."""
+MIN_OPERATING_POINT = 1e-3
+DIFFERENCE = 1e-4
 
-    def __init__(
-        self,
-        response: TextbookResponse,
-        samples: Samples,
-        spec: RobotSpec,
-        like: TaylorModel,
-    ) -> None:
-        self.response = response
-        self.spec = spec
-        self.like = like
-        self.x = samples.x
-        self.states = len(spec.state)
-        self.terms: dict[int, dict[tuple[int, ...], float]] = {
-            d: {} for d in range(len(spec.dof_names))
-        }
-        self.limits = np.tile([-np.inf, np.inf], (self.states, 1))
 
-    def rate_of(self, actuator: int) -> float:
-        """Returns the rate [1/s] at which a step of the model brings an actuator to its target."""
-        return self.rate_at(float(self.response.lag_s[actuator]))
+def assume_textbook(
+    model: TaylorModel, spec: RobotSpec, unmoved: tuple[str, ...]
+) -> tuple[TaylorModel, tuple[str, ...]]:
+    """Adds textbook terms for inputs that never moved; ConfigError if the spec has no textbook."""
+    # A fit at a constant input is a section through the full model: `wz = c speed`, measured at
+    # the steering angle s0, becomes `wz = (c/s0) speed*steering`; at s0 = 0, the textbook's
+    # parameters are used.
+    named = model.named
+    rows = {dof: dict(terms) for dof, terms in named.terms.items()}
+    point = dict(zip(model.variables, (model.low + model.high) / 2.0, strict=True))
+    completion = _Completion(
+        model.dt, spec, textbook(spec), unmoved, point, rows, list(model.assumed)
+    )
+    for i, variable in enumerate(spec.state):
+        if variable.twist:  # by definition
+            rows[variable.twist] = {variable.name: 1.0}
+        elif variable.name in unmoved:
+            completion.restore_twist(i)
+    for i in range(len(spec.state)):
+        completion.restore_rate(i)
+    update = {
+        "terms": rows,
+        "assumed": tuple(completion.assumed),
+        "valid": completion.widened(named.valid),
+    }
+    return named.model_copy(update=update).model(), tuple(completion.notes)
 
-    def rate_at(self, lag: float) -> float:
-        """Returns that rate [1/s] at a lag [s]."""
-        dt = self.like.dt
-        return (1.0 - float(np.exp(-dt / lag))) / dt
 
-    def unit(self, place: int) -> NDArray[np.int64]:
-        """Returns the exponents (V,) of a variable."""
-        row = np.zeros(self.x.shape[1], dtype=np.int64)
-        row[place] = 1
-        return row
+@dataclass(frozen=True)
+class _Completion:
+    dt: float  # step of the model [s]
+    spec: RobotSpec
+    book: Textbook
+    unmoved: tuple[str, ...]
+    point: dict[str, float]  # middle of each variable's range
+    rows: dict[str, dict[str, float]]  # coefficients by dof and term, to be completed
+    assumed: list[tuple[str, str]]  # (dof, term) pairs
+    notes: list[str] = field(default_factory=list)
 
-    def add(self, dof: int, row: NDArray[np.int64], value: float) -> None:
-        """Adds a term to a degree of freedom."""
-        key = tuple(row.tolist())
-        self.terms[dof][key] = self.terms[dof].get(key, 0.0) + value
+    def restore_twist(self, i: int) -> None:
+        """Restores the products with state variable `i` in the body twist."""
+        name = self.spec.state[i].name
+        for d, dof in enumerate(("vx", "vy", "wz")):
+            for product in self.book.structure[dof]:
+                factors = product.split("*")
+                if name not in factors:
+                    continue
+                factors.remove(name)
+                learnt = self.rows[dof].pop("*".join(factors) or "1", None)
+                value = self.point[name]
+                if learnt is not None and abs(value) > MIN_OPERATING_POINT:
+                    coefficient = learnt / value
+                    source = f"measured at {name} = {value:g}"
+                else:
+                    coefficient = self._slope(d, product)
+                    source = self.source
+                if coefficient == 0.0:
+                    continue
+                self.rows[dof][product] = coefficient
+                self.assumed.append((dof, product))
+                term = f"{dof} = {coefficient:.4g}*{product} ({source})"
+                finding = f"{term}, since {name} never moved"
+                advice = f"to learn it, drive with {name} over its whole range"
+                self.notes.append(Gap(f"Assumed, not learnt: {finding}; {advice}."))
 
-    def add_expanded(
-        self, dof: int, target: Array, rows: Sequence[NDArray[np.int64]]
-    ) -> None:
-        """Adds the terms that best approximate a target (T,) over the samples."""
-        powers = np.array(rows, dtype=np.int64).reshape(len(rows), self.x.shape[1])
-        chi = evaluate(self.x, powers)
-        size = np.maximum(np.linalg.norm(chi, axis=0), 1e-12)
-        beta = np.linalg.lstsq(chi / size, target, rcond=1e-9)[0]
-        shown = np.abs(beta) > NEGLIGIBLE * max(float(np.linalg.norm(target)), 1e-12)
-        beta = np.linalg.lstsq((chi / size)[:, shown], target, rcond=1e-9)[0]
-        for row, value in zip(powers[shown], beta / size[shown], strict=True):
-            self.add(dof, row, float(value))
+    def _slope(self, d: int, product: str) -> float:
+        """Returns the coefficient of a product of state variables in the textbook twist, at 0."""
+        index = [
+            i for i, v in enumerate(self.spec.state) if v.name in product.split("*")
+        ]
+        value = 0.0
+        for signs in 1.0 - 2.0 * np.array(list(np.ndindex(*(2,) * len(index)))):
+            state = np.zeros(len(self.spec.state))
+            state[index] = DIFFERENCE * signs
+            value += float(np.prod(signs) * self.book.twist(state)[d])
+        return value / (2.0 * DIFFERENCE) ** len(index)
 
-    def steered_angle(self, steering: Array) -> Array:
-        """Returns the angle (T,) of the steered wheel for commanded steering."""
-        gain = self.response.gain[2, int(np.argmax(np.abs(self.response.gain[2])))]
-        angle = gain * steering + self.response.offset[2]
-        return np.asarray(np.clip(angle, -WIDEST_ANGLE, WIDEST_ANGLE))
+    def widened(
+        self, valid: dict[str, tuple[float, float]]
+    ) -> dict[str, tuple[float, float]]:
+        """Returns the ranges, widened to what commands can reach for assumed parts of the twist."""
+        assumed = {dof for dof, _ in self.assumed}
+        for variable in self.spec.state:
+            if variable.twist and f"d_{variable.name}" in assumed:
+                far = float(reach(self.spec)[POSE_RATES.index(variable.twist)])
+                low, high = valid[variable.name]
+                valid = valid | {variable.name: (min(low, -far), max(high, far))}
+        return valid
 
-    def add_bicycle(
-        self,
-        speed: NDArray[np.int64],
-        steering: NDArray[np.int64],
-        speeds: Array,
-        angles: Array,
-        turns: Sequence[NDArray[np.int64]],
-    ) -> None:
-        """Adds the twist of a bicycle by two variables, for its speeds and angles (T,)."""
-        bicycle = self.response.bicycle
-        along = speeds
-        across = speeds * np.tan(angles)
-        if bicycle.front_drive:
-            along = speeds * np.cos(angles)
-            across = speeds * np.sin(angles)
-        length = bicycle.wheelbase * (1.0 + bicycle.understeer * speeds**2)
-        self.add_expanded(0, along, [speed, speed + 2 * steering])
-        self.add_expanded(2, across / length, turns)
+    @property
+    def source(self) -> str:
+        """States where the textbook's parameters come from."""
+        assumed = ", ".join(self.spec.assumed)
+        if not assumed:
+            return "from the parameters in the robot's YAML file"
+        return f"by default, because the robot's YAML file gives no {assumed}"
 
-    def add_commanded_bicycle(self, place: int, steering: int, speeds: Array) -> None:
-        """Adds the twist of a bicycle by its speed, or its command, and its commanded angle."""
-        v = self.unit(place)
-        steer = self.unit(steering)
-        angles = self.steered_angle(self.x[:, steering])
-        turns = [v, v + steer, v + 2 * steer, v + 3 * steer, 3 * v + steer]
-        self.add_bicycle(v, steer, speeds, angles, turns)
-
-    def add_follower(self, state: int, rate: float, gains: Array) -> None:
-        """Adds the rate of a state that follows the commands by gains (C,)."""
-        self.add(3 + state, self.unit(state), -rate)
-        for command in np.flatnonzero(gains).tolist():
-            row = self.unit(self.states + command)
-            self.add(3 + state, row, rate * float(gains[command]))
-
-    def add_twist_of_commands(self) -> None:
-        """Adds the twist of a robot without a state."""
-        if self.response.bicycle.used:
-            speed, steering = _find_bicycle_commands(self.response)
-            target = self.response.gain[0, speed] * self.x[:, speed]
-            self.add_commanded_bicycle(speed, steering, target)
+    def restore_rate(self, i: int) -> None:
+        """Makes a state follow the commands that never moved, with its lag (learnt or nominal)."""
+        name = self.spec.state[i].name
+        row = self.rows[f"d_{self.spec.state[i].name}"]
+        lag = float(self.book.lag[i])
+        source = f" ({self.source})"
+        rate = float(-np.expm1(-self.dt / lag)) / self.dt
+        if name in row:
+            rate = -row[name]
+            lag = -1.0 / row[name]
+            source = ""
+        added = self._turning(i, row, rate)
+        if added is None:
+            added = self._following(i, row, rate)
+        if not added:
             return
-        for dof, command in np.argwhere(self.response.gain).tolist():
-            self.add(dof, self.unit(command), float(self.response.gain[dof, command]))
-
-    def add_twist_as_state(self) -> None:
-        """Adds the rates of a robot whose state is its twist."""
-        for i, variable in enumerate(self.spec.state):
-            if variable.twist is None:
-                continue
-            part = POSE_RATES.index(variable.twist)
-            if part == 1 and not self.spec.moves_sideways:
-                continue
-            self.add(part, self.unit(i), 1.0)
-            self.add_follower(i, self.rate_of(part), self.response.gain[part])
-            if part == 0:
-                self.limits[i] = self.speed_limits()
-
-    def add_actuators(self) -> None:
-        """Adds the rates of a speed and a steering angle, and the twist by them."""
-        response = self.response
-        is_speed = np.arange(2) == _find_bicycle_commands(response)[0]
-        rate = self.rate_of(2)
-        self.add_follower(0, self.rate_of(0), np.where(is_speed, response.gain[0], 0.0))
-        self.limits[0] = self.speed_limits()
-        self.add_follower(1, rate, np.where(is_speed, 0.0, response.gain[2]))
-        self.add(4, 0 * self.unit(0), rate * float(response.offset[2]))
-        v = self.unit(0)
-        angle = self.unit(1)
-        turns = [v + angle, 2 * v + angle, 3 * v + angle, v + 3 * angle]
-        self.add_bicycle(v, angle, self.x[:, 0], self.x[:, 1], turns)
-
-    def add_followers(self) -> None:
-        """Adds the rates of states that follow commands one by one, and the twist by them."""
-        names = [c.name for c in self.spec.command]
-        follow = [names.index(str(v.follows)) for v in self.spec.state]
-        for i, command in enumerate(follow):
-            actuator, gain = _find_actuator(self.response, command)
-            gains = np.where(np.arange(len(names)) == command, gain, 0.0)
-            self.add_follower(i, self.rate_of(actuator), gains)
-            if actuator == 0:
-                self.limits[i] = self.speed_limits()
-            if not self.response.bicycle.used:
-                self.add(actuator, self.unit(i), 1.0)
-        if self.response.bicycle.used:
-            speed, steering = map(follow.index, _find_bicycle_commands(self.response))
-            self.add_commanded_bicycle(speed, steering, self.x[:, speed])
-
-    def add_wheels(self) -> None:
-        """Adds the rates of wheels, and the twist by them."""
-        gain = self.response.gain
-        book = textbook(self.spec)
-        per_command = book.target(np.eye(len(self.spec.command)))  # (C, S)
-        per_wheel = book.twist(np.eye(self.states))  # (S, 3)
-        steady = (per_command @ per_wheel).T  # (3, C)
-        lag = float(self.response.lag_s[gain.any(axis=1)].mean())
-        for wheel in range(self.states):
-            self.add_follower(wheel, self.rate_at(lag), per_command[:, wheel])
-        for dof in range(3):
-            power = float(steady[dof] @ steady[dof])
-            if power > 0.0:
-                times = float(gain[dof] @ steady[dof]) / power
-                for wheel in np.flatnonzero(per_wheel[:, dof]).tolist():
-                    share = times * float(per_wheel[wheel, dof])
-                    self.add(dof, self.unit(wheel), share)
-
-    def speed_limits(self) -> tuple[float, float]:
-        """Returns the maximum fall and rise of the speed, infinite where none was found."""
-        rise, fall = map(float, self.response.limit)
-        most = UNLIMITED * LIMIT_RANGE[1]
-        return -fall if fall < most else -np.inf, rise if rise < most else np.inf
-
-    def made(self) -> TaylorModel:
-        """Builds the model."""
-        keys = sorted(set().union(*self.terms.values()))
-        coefficients = np.zeros((len(self.spec.dof_names), len(keys)))
-        for dof, row in self.terms.items():
-            for key, value in row.items():
-                coefficients[dof, keys.index(key)] = value
-        powers = np.array(keys, dtype=np.int64).reshape(len(keys), self.x.shape[1])
-        return TaylorModel(
-            self.spec.variable_names,
-            self.spec.dof_names,
-            self.spec.dof_units,
-            powers=powers,
-            coefficients=coefficients,
-            dt=self.like.dt,
-            low=self.x.min(axis=0),
-            high=self.x.max(axis=0),
-            bounded=self.like.bounded,
-            inputs=tuple(_find_dead_zones(self.response, self.spec)),
-            limits=self.limits,
+        if name not in row:
+            added[name] = -rate
+        row.update(added)
+        self.assumed.extend((f"d_{name}", term) for term in added)
+        follows = ", ".join(term for term in added if term != name)
+        self.notes.append(
+            Gap(
+                f"Assumed, not learnt: {name} follows {follows} with a lag of {lag:.3g} s{source}."
+            )
         )
+
+    def _following(
+        self, i: int, row: dict[str, float], rate: float
+    ) -> dict[str, float]:
+        """Returns the terms by which a state follows commands, one per command."""
+        commands = self.spec.command
+        target = self.book.target
+        here = np.array([self.point[c.name] for c in commands])
+        added = {}
+        constant = 0.0
+        for j, command in enumerate(commands):
+            step = np.where(np.arange(len(commands)) == j, DIFFERENCE, 0.0)
+            slope = (target(here + step)[i] - target(here - step)[i]) / (
+                2.0 * DIFFERENCE
+            )
+            if command.name in self.unmoved and not abs(slope) < 1e-9:
+                added[command.name] = rate * float(slope)
+                constant -= added[command.name] * here[j]
+        if added:
+            constant += row.pop("1", 0.0)
+            if self.spec.state[i].name in row and abs(constant) > 1e-9 * rate:
+                row["1"] = constant
+        return added
+
+    def _turning(
+        self, i: int, row: dict[str, float], rate: float
+    ) -> dict[str, float] | None:
+        """Returns the term by which a car turns whose state is its twist; None for other rates.
+
+        It is the product of speed and steering, measured at a constant if there is one.
+        """
+        structure = probe_structure(self.spec)
+        state = {v.twist: v.name for v in self.spec.state}
+        turned = self.spec.state[i].twist == "wz" and "vx" in state
+        if structure is None or not structure[1].used or not turned:
+            return None
+        k = int(np.argmax(np.abs(structure[0][2])))
+        names = state["vx"], self.spec.command[k].name
+        still = [name for name in names if name in self.unmoved]
+        if not still:
+            return {}
+        learnt = row.pop(
+            "*".join(name for name in names if name not in still) or "1", None
+        )
+        value = float(np.prod([self.point[name] for name in still]))
+        if learnt is not None and abs(value) > MIN_OPERATING_POINT:
+            return {"*".join(names): learnt / value}
+        return {
+            "*".join(names): rate * float(structure[0][2, k]) / structure[1].wheelbase
+        }

@@ -9,18 +9,17 @@ import numpy as np
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.acceptance import THRESHOLDS, describe_shortfall
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import TimingEstimate
 from nics_drl_bridge.identify.drive import MAX_GAP_S, Drive
-from nics_drl_bridge.identify.excitation import Excitation, select_plausible_rows
 from nics_drl_bridge.identify.findings import (
     Findings,
     require_fit,
     require_model,
     require_samples,
 )
-from nics_drl_bridge.identify.fit import Fit
+from nics_drl_bridge.identify.fit import Excitation, Fit, select_plausible_rows
+from nics_drl_bridge.identify.judgement import THRESHOLDS, describe_shortfall
 from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.open_loop import (
     HORIZON_S,
@@ -332,16 +331,8 @@ def describe_unlearnt(
     `levels` are the numbers of different values of the commands as recorded, because a motor that
     saturates reduces many values to two.
     """
-    followed = {response.command for response in calibration.responses}
     excitation = linear.regression.excitation
-    unmoved = ", ".join(list_missed(linear, spec))
-    if unmoved:
-        finding = f"The model has no terms of {unmoved}, which never moved"
-        yield Gap(f"{finding}: it is only valid for this drive's constant value.")
-    still = _list_commands(excitation.unmoved, spec)
-    missing = ", ".join(name for name in still if name not in followed)
-    if missing:
-        yield Gap(f"Drive with {missing} changing over the whole range to learn them.")
+    yield from _describe_unmoved(linear, calibration, spec)
     together = _join_names(excitation.together)
     if together:
         units = {c.unit for c in spec.command if c.name in excitation.together}
@@ -351,23 +342,40 @@ def describe_unlearnt(
         yield Gap(
             f"{together} {why}: {shares}, and {valid}; drive each on its own to learn."
         )
-    copies = _join_names(
-        [v.name for v in spec.state if v.name in linear.regression.dependent]
-    )
+    dependent = linear.regression.dependent
+    copies = _join_names([v.name for v in spec.state if v.name in dependent])
     if copies:
         why = "always depended on the other variables, so their effects can't be separated"
         yield Gap(
             f"{copies} {why}: the model omits them, and is valid only while that is so."
         )
-    moved = {
-        name: count for name, count in levels.items() if name not in excitation.unmoved
-    }
-    coarse = _join_names([name for name, count in moved.items() if count == FEW_LEVELS])
+    coarse = _join_names(
+        [
+            name
+            for name, count in levels.items()
+            if count == FEW_LEVELS and name not in excitation.unmoved
+        ]
+    )
     if coarse:
         finding = "between them the model is a straight line, whatever the robot does"
         yield Gap(
             f"{coarse} took only two values: {finding}; drive with values in between."
         )
+
+
+def _describe_unmoved(
+    linear: Fit, calibration: Calibration, spec: RobotSpec
+) -> Iterator[str]:
+    """Yields sentences on variables that never moved."""
+    unmoved = ", ".join(list_missed(linear, spec))
+    if unmoved:
+        finding = f"The model has no terms of {unmoved}, which never moved"
+        yield Gap(f"{finding}: it is only valid for this drive's constant value.")
+    followed = {response.command for response in calibration.responses}
+    still = _list_commands(linear.regression.excitation.unmoved, spec)
+    missing = ", ".join(name for name in still if name not in followed)
+    if missing:
+        yield Gap(f"Drive with {missing} changing over the whole range to learn them.")
 
 
 def list_doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:

@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.calibration import (
+    Calibration,
+    choose_half_width,
+    measure_body_twists,
+)
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.kernels import STRAIGHT, BicycleGeometry, roll_windows
-from nics_drl_bridge.identify.motion import choose_half_width, measure_body_twists
 from nics_drl_bridge.identify.open_loop import Windows, select_windows
 from nics_drl_bridge.identify.shooting import HEADING_ARM_M
 from nics_drl_bridge.identify.signals import average_held, lag_behind, unwrap_headings
@@ -31,7 +34,6 @@ LOSS_SCALE = 0.2  # scale of the soft L1 loss [m/s]
 MOST_EVALUATIONS = 60
 TOLERANCE = 1e-4
 GUESS_S = 0.5  # gains and lags are first guessed from motions over this time,
-JUMP = 3.0  # speeds beyond this many times the 90th percentile are localiser jumps
 # at each of these delays for streams on one clock
 DELAYS_S = np.arange(-0.1, 0.51, 0.05)
 FAR_DELAYS_S = np.arange(-1.0, 1.01, 0.05)  # and at these for streams on two
@@ -110,22 +112,6 @@ def _measure_twists(drive: Drive) -> tuple[Array, Array]:
     return grid, measure_body_twists(drive, Calibration(), grid, width)
 
 
-def select_calm_windows(
-    drive: Drive, until_s: float, horizon: float, spacing: float
-) -> tuple[Windows, Array]:
-    """Selects windows without localiser jumps, and twists (W, 3) at their starts."""
-    chosen = select_windows(drive, Calibration(), 0.0, until_s, horizon, spacing)
-    if not len(chosen.start_t):
-        return chosen, np.zeros((0, 3))
-    brief = select_windows(drive, Calibration(), 0.0, until_s, GUESS_S, SPACING_S)
-    twist = estimate_twists_at(drive, chosen.start_t)
-    fastest = JUMP * np.percentile(brief.path, 90) / GUESS_S
-    moved = np.hypot(*(chosen.end - chosen.start)[:, :2].T) / horizon
-    calm = np.maximum(moved, np.hypot(twist[:, 0], twist[:, 1])) <= fastest
-    calm |= calm.mean() < 0.5
-    return chosen.rows(calm), twist[calm]
-
-
 class _Course(NamedTuple):
     start_t: Array  # (W,) starts of windows, on the commands' clock [s]
     duration: Array  # (W, H) durations of predictions [s]
@@ -193,49 +179,56 @@ class _Form:
     # True if acceleration and deceleration have the same limit
     one_limit: bool = False
 
-    @property
-    def slips(self) -> bool:
-        """True if understeer is free."""
-        return self.start.bicycle.used and not self.start.bicycle.front_drive
+    def list_free(self) -> tuple[NDArray[np.bool_], ...]:
+        """Returns masks of the free values, in the order of `_flatten`."""
+        bicycle = self.start.bicycle
+        follows = np.asarray(self.moves.any(axis=1))
+        return (
+            np.array([True]),
+            self.moves,
+            follows,
+            follows,
+            np.array([True, not self.one_limit]),
+            np.array([bicycle.used and not bicycle.front_drive]),
+            self.mounted,
+        )
 
     def pack(self) -> Array:
-        """Returns the free values of the start (P,); positive ones as logarithms."""
-        r = self.start
-        rows = self.moves.any(axis=1)
-        return np.concatenate(
-            [
-                [r.delay_s],
-                r.gain[self.moves],
-                r.offset[rows],
-                np.log(r.lag_s[rows]),
-                np.log(r.limit),
-                [r.bicycle.understeer] * self.slips,
-                r.mounting[self.mounted],
-            ]
-        )
+        """Returns the free values of the start (P,)."""
+        pairs = zip(_flatten(self.start), self.list_free(), strict=True)
+        return np.concatenate([values[free] for values, free in pairs])
 
     def unpack(self, theta: Array) -> TextbookResponse:
         """Returns the response for free values (P,)."""
-        r = self.start
-        rows = self.moves.any(axis=1)
-        count = [1, int(self.moves.sum()), *[int(rows.sum())] * 2, 2, int(self.slips)]
-        delay, gains, offsets, lags, limits, understeer, place = np.split(
-            theta, np.cumsum(count)
-        )
-        gain, offset, lag, mounting = (
-            a.copy() for a in (r.gain, r.offset, r.lag_s, r.mounting)
-        )
-        gain[self.moves] = gains
-        offset[rows] = offsets
-        mounting[self.mounted] = place
-        lag[rows] = np.exp(np.clip(lags, *np.log(LAG_RANGE_S)))
-        limit = np.exp(np.clip(limits, *np.log(LIMIT_RANGE)))
-        if self.one_limit:
-            limit = np.full(2, limit[0])
-        bicycle = r.bicycle._replace(understeer=float(understeer.sum()))
+        masks = self.list_free()
+        parts = np.split(theta, np.cumsum([mask.sum() for mask in masks])[:-1])
+        values = _flatten(self.start)
+        for value, mask, part in zip(values, masks, parts, strict=True):
+            value[mask] = part
+        delay, gain, offset, log_lag, log_limit, understeer, mounting = values
+        limit = np.exp(np.clip(log_limit, *np.log(LIMIT_RANGE)))
         return TextbookResponse(
-            float(delay[0]), gain, offset, lag, limit, bicycle, mounting
+            float(delay[0]),
+            gain,
+            offset,
+            np.exp(np.clip(log_lag, *np.log(LAG_RANGE_S))),
+            np.full(2, limit[0]) if self.one_limit else limit,
+            self.start.bicycle._replace(understeer=float(understeer[0])),
+            mounting,
         )
+
+
+def _flatten(response: TextbookResponse) -> tuple[Array, ...]:
+    """Returns copies of the values of a response; positive ones as logarithms."""
+    return (
+        np.array([response.delay_s]),
+        response.gain.copy(),
+        response.offset.copy(),
+        np.log(response.lag_s),
+        np.log(response.limit),
+        np.array([response.bicycle.understeer]),
+        response.mounting.copy(),
+    )
 
 
 def probe_structure(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
@@ -275,7 +268,8 @@ def _guess_response(
     """Fits gains, lags, maybe offsets linearly to motions over `GUESS_S` at the best delay."""
     structure = probe_structure(drive.spec)
     book, bicycle = structure or (np.ones((3, len(drive.spec.command))), STRAIGHT)
-    seen, before = select_calm_windows(drive, until_s, GUESS_S, SPACING_S)
+    seen = select_windows(drive, Calibration(), 0.0, until_s, GUESS_S, SPACING_S)
+    before = estimate_twists_at(drive, seen.start_t)
     span = (seen.end_t - seen.start_t)[:, None]
     twist = geometry.log(geometry.between(seen.start, seen.end)) / span
     change = (estimate_twists_at(drive, seen.end_t) - before) / span
@@ -285,11 +279,9 @@ def _guess_response(
     for delay in DELAYS_S if one_clock else FAR_DELAYS_S:
         shift = clock_offset - delay
         u = average_held(command, drive.spec, seen.start_t + shift, seen.end_t + shift)
-        expected = u @ book.T
         rotation = 0.0
         if structure is not None:
-            a, b = ((v[:, 0] + 1j * v[:, 1]) for v in (expected, twist))
-            rotation = float(np.angle((a.conj() * b).sum()))
+            rotation = _find_rotation(u @ book.T, twist)
         left, gain, offset, lag = _regress_twists(
             u,
             _rotate_twists(twist, -rotation),
@@ -298,14 +290,10 @@ def _guess_response(
             bicycle,
             offsets,
         )
+        place = np.array([0.0, 0.0, -rotation])
+        limit = np.full(2, LIMIT)
         response = TextbookResponse(
-            float(delay),
-            gain,
-            offset,
-            lag,
-            np.full(2, LIMIT),
-            bicycle,
-            np.array([0.0, 0.0, -rotation]),
+            float(delay), gain, offset, lag, limit, bicycle, place
         )
         candidates.append((left, response))
     _, start = min(candidates, key=lambda pair: pair[0])
@@ -313,6 +301,12 @@ def _guess_response(
     mounted = np.array([True, np.count_nonzero(book[0]) < 2, True])
     mounted &= structure is not None
     return _Form(start, book != 0.0, mounted)
+
+
+def _find_rotation(expected: Array, twist: Array) -> float:
+    """Returns the angle by which measured velocities are turned from the expected ones [rad]."""
+    a, b = (v[:, 0] + 1j * v[:, 1] for v in (expected, twist))
+    return float(np.angle((a.conj() * b).sum()))
 
 
 def _regress_twists(
@@ -361,47 +355,66 @@ def fit_yardstick(
     Minimises open-loop errors after `HORIZONS_S`. With `one_limit`, acceleration and deceleration
     have the same limit. Raises RecordingError if the part is too short for these horizons.
     """
-    spacing = max(SPACING_S, (until_s - HORIZONS_S[-1]) / MOST_WINDOWS)
-    chosen, twist = select_calm_windows(drive, until_s, HORIZONS_S[-1], spacing)
+    longest = HORIZONS_S[-1]
+    spacing = max(SPACING_S, (until_s - longest) / MOST_WINDOWS)
+    chosen = select_windows(drive, Calibration(), 0.0, until_s, longest, spacing)
     if not len(chosen.start_t):
-        fault = f"the first {until_s:.1f} s contain no window of {HORIZONS_S[-1]:g} s"
+        fault = f"the first {until_s:.1f} s contain no window of {longest:g} s"
         raise RecordingError(
             f"{drive.recording.source}: {fault}; record a longer drive."
         )
-    horizons = np.tile(HORIZONS_S, (len(chosen.start_t), 1))
-    course = _sample_commands(drive, chosen.start_t + clock_offset_s, horizons)
-    at = chosen.start_t[:, None] + horizons
-    pose = unwrap_headings(drive.dated.values)
-    ends = np.stack(
-        [np.interp(at, drive.dated.t, column) for column in pose.T], axis=-1
-    )
-    measured = geometry.between(chosen.start[:, None], ends)
-
-    def fitted(form: _Form) -> tuple[float, TextbookResponse]:
-        def residuals(theta: Array) -> Array:
-            error = _predict_ends(form.unpack(theta), course, twist) - measured
-            error[..., 2] = HEADING_ARM_M * geometry.wrap_angle(error[..., 2])
-            rates = np.clip(error / horizons[..., None], -100.0, 100.0)
-            return np.asarray(np.nan_to_num(rates)).ravel()
-
-        theta = form.pack()
-        solution = scipy.optimize.least_squares(
-            residuals,
-            theta,
-            x_scale=np.maximum(np.abs(theta), 0.05),
-            loss="soft_l1",
-            diff_step=1e-4,
-            f_scale=LOSS_SCALE,
-            max_nfev=MOST_EVALUATIONS,
-            ftol=TOLERANCE,
-            xtol=TOLERANCE,
-        )
-        return float(solution.cost), form.unpack(solution.x)
-
+    motions = _Motions.of(drive, chosen, clock_offset_s)
     guesses = [
         _guess_response(drive, until_s, clock_offset_s, offsets)
         for offsets in (True, False)
     ]
-    guesses = [replace(guess, one_limit=one_limit) for guess in guesses]
-    best = min((fitted(guess) for guess in guesses), key=lambda pair: pair[0])
-    return Yardstick(best[1], clock_offset_s)
+    fits = [_search(replace(guess, one_limit=one_limit), motions) for guess in guesses]
+    _, response = min(fits, key=lambda fit: fit[0])
+    return Yardstick(response, clock_offset_s)
+
+
+class _Motions(NamedTuple):
+    """What a textbook is to predict."""
+
+    course: _Course
+    twist: Array  # (W, 3) at the starts of windows
+    measured: Array  # (W, H, 3) poses at the horizons, relative to the starts
+
+    @classmethod
+    def of(cls, drive: Drive, chosen: Windows, clock_offset_s: float) -> "_Motions":
+        """Returns the motions over `HORIZONS_S` from the starts of windows."""
+        duration = np.tile(HORIZONS_S, (len(chosen.start_t), 1))
+        at = chosen.start_t[:, None] + duration
+        pose = unwrap_headings(drive.dated.values)
+        ends = [np.interp(at, drive.dated.t, column) for column in pose.T]
+        return cls(
+            _sample_commands(drive, chosen.start_t + clock_offset_s, duration),
+            estimate_twists_at(drive, chosen.start_t),
+            geometry.between(chosen.start[:, None], np.stack(ends, axis=-1)),
+        )
+
+
+def _search(form: _Form, motions: _Motions) -> tuple[float, TextbookResponse]:
+    """Returns the least loss of predictions by a form, and the response that has it."""
+
+    def residuals(theta: Array) -> Array:
+        response = form.unpack(theta)
+        error = _predict_ends(response, motions.course, motions.twist)
+        error -= motions.measured
+        error[..., 2] = HEADING_ARM_M * geometry.wrap_angle(error[..., 2])
+        rates = np.clip(error / motions.course.duration[..., None], -100.0, 100.0)
+        return np.asarray(np.nan_to_num(rates)).ravel()
+
+    theta = form.pack()
+    solution = scipy.optimize.least_squares(
+        residuals,
+        theta,
+        x_scale=np.maximum(np.abs(theta), 0.05),
+        loss="soft_l1",
+        diff_step=1e-4,
+        f_scale=LOSS_SCALE,
+        max_nfev=MOST_EVALUATIONS,
+        ftol=TOLERANCE,
+        xtol=TOLERANCE,
+    )
+    return float(solution.cost), form.unpack(solution.x)

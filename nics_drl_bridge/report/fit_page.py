@@ -4,18 +4,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nics_drl_bridge.files import write_text
-from nics_drl_bridge.identify.acceptance import Verdict, select_usual_horizon
-from nics_drl_bridge.identify.conclusion import (
-    Conclusion,
-    conclude,
-    format_error,
-    is_share,
-)
 from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.identify.judgement import Verdict, select_usual_horizon
 from nics_drl_bridge.identify.report import (
     COMPARED,
     HEADS,
+    Conclusion,
+    conclude,
     format_equations,
+    format_error,
+    is_share,
     tabulate_judgement,
 )
 from nics_drl_bridge.report import fit_pictures, html

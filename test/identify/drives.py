@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from scipy.signal import cont2discrete, lfilter
@@ -12,6 +13,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.identify import identify as stages
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.verdict import collect_calibration_notes
 from nics_drl_bridge.recording.recording import Recording, Stream, check
 from nics_drl_bridge.recording.textbook import record
@@ -327,3 +329,9 @@ def draw_commands(
         spec.command_low, spec.command_high, (-(-count // hold), len(spec.command))
     )
     return np.repeat(held, hold, axis=0)[:count]
+
+
+@cache
+def identify_servoed() -> Identified:
+    """A model of the usual drive of a robot with a motor and a servo, for several tests."""
+    return stages.identify(servoed(), tricycle(), alpha="auto")

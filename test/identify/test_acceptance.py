@@ -8,7 +8,9 @@ import pytest
 from identify import planted
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import generate, load_model, mount_lidar, save_model
-from nics_drl_bridge.identify.acceptance import (
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.judgement import (
     Outcome,
     Verdict,
     combine_ratings,
@@ -16,13 +18,12 @@ from nics_drl_bridge.identify.acceptance import (
     describe_shortfall,
     estimate_comparison_noise,
     is_beaten_by_textbook,
+    list_doubts_of_commands,
     loses_to_textbook,
     rate,
     rate_unseen,
 )
-from nics_drl_bridge.identify.conclusion import conclude
-from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.report import format_with_error
+from nics_drl_bridge.identify.report import conclude, format_with_error
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors
 
 RADIUS_M = 0.2
@@ -229,3 +230,30 @@ def test_the_written_textbook_is_that_of_the_trial_and_fitted_no_further(command
 )
 def test_a_coefficient_is_printed_so_that_it_can_be_used(value, error, text):
     assert format_with_error(value, error) == text
+
+
+def doubts(error: float, without: float = 1.0, latency: float = 0.1) -> list[str]:
+    ends = EndErrors(error, 0.1), EndErrors(without, 0.1)
+    judgement = (HorizonErrors(5.0, 9, 2.0, *ends),)
+    return list(
+        list_doubts_of_commands(
+            judgement, replace(Calibration(), command_latency_s=latency)
+        )
+    )
+
+
+def test_commands_that_hardly_help_are_said():
+    (doubt,) = doubts(0.9)
+    assert doubt.startswith(
+        "The commands hardly help: predictions by them end 0.9 m off after 5 s"
+    )
+
+
+@pytest.mark.parametrize("latency", [1.4, -0.5])
+def test_an_implausible_latency_is_said(latency):
+    (doubt,) = doubts(0.1, latency=latency)
+    assert f"A latency of {latency:.2f} s" in doubt
+
+
+def test_commands_that_help_at_once_raise_no_doubt():
+    assert doubts(0.3) == []

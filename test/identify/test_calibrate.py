@@ -75,8 +75,10 @@ def test_a_textbook_recording_needs_no_correction_and_is_taken_digit_by_digit(na
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ackermann", "differential"])
-@pytest.mark.parametrize(("ahead", "rotation"), [(0.31, 2.5), (-1.7, -1.48)])
+@pytest.mark.parametrize(
+    ("name", "ahead", "rotation"),
+    [("ackermann", -1.7, -1.48), ("differential", 0.31, 2.5)],
+)
 def test_clock_offset_rotation_lever_arm_and_noise_are_found_together(
     name, ahead, rotation
 ):

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from identify.drives import MOTOR, drive, servoed, tricycle
+from identify.drives import MOTOR, drive, identify_servoed, servoed, tricycle
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import SEPARABLE_S, measure_timing
@@ -19,7 +19,7 @@ SUM = "command_latency_and_speed_lag_s"
 
 @pytest.mark.slow
 def test_a_servo_of_second_order_is_not_taken_for_latency():
-    found = identify(servoed(), tricycle()).calibration
+    found = identify_servoed().calibration
     assert found.command_latency_s == pytest.approx(0.1, abs=0.003)
     assert found.uncertainty["command_latency_s"] < SEPARABLE_S
     speed, steering = found.responses

@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nics_drl_bridge.identify.acceptance import Verdict
-from nics_drl_bridge.identify.conclusion import (
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.judgement import Verdict
+from nics_drl_bridge.identify.report import (
     UNTRIED,
     accuracy,
     conclude,
-    format_error,
+    format_opening,
+    format_report,
 )
-from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.report import format_opening, format_report
 from nics_drl_bridge.identify.verdict import Gap, Mistake
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import build_robot, load_robot
@@ -80,10 +80,6 @@ def test_the_report_opens_with_the_conclusion_and_the_model(found):
     assert "Verdict: good. On unseen data" in first.split("\n\n")[0]
     assert "d_speed = " in first
     assert len(first.splitlines()) < 20 < len(report.splitlines())
-
-
-def test_an_error_without_a_path_is_in_metres():
-    assert format_error(EndErrors(0.5, 0.0), 0.0) == "0.5 m"
 
 
 def test_gaps_are_those_notes_that_tell_what_the_drive_could_not_teach(found):

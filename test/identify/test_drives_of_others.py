@@ -5,15 +5,17 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+import pytest
+
 from nics_drl_bridge.config import parse_yaml
-from nics_drl_bridge.identify.acceptance import (
+from nics_drl_bridge.identify.identify import Identified, identify
+from nics_drl_bridge.identify.judgement import (
     Outcome,
     Verdict,
     compare,
     select_usual_horizon,
 )
-from nics_drl_bridge.identify.conclusion import conclude
-from nics_drl_bridge.identify.identify import Identified, identify
+from nics_drl_bridge.identify.report import conclude
 from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.readers import open_drive, open_source
@@ -51,6 +53,7 @@ def test_the_gap_of_a_drive_on_slippery_floors_is_named_and_limits_the_verdict(
     assert any("The pose is missing for" in doubt for doubt in conclusion.doubts)
 
 
+@pytest.mark.campaign
 def test_a_plain_drive_is_predicted_no_worse_than_by_its_textbook(shared_recordings):
     found = identify_by_draft(shared_recordings / "f110_frictionmaps" / "DS5")
     (at,) = select_usual_horizon(found.judgement)

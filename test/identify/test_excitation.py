@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nics_drl_bridge.identify.excitation import (
+from nics_drl_bridge.identify.fit import (
     measure_coverage,
     split_independent_columns,
 )

@@ -10,10 +10,10 @@ import pytest
 from scipy.signal import lfilter
 
 from identify.drives import make_model, slipping_car
-from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.findings import Findings, resample_drive
 from nics_drl_bridge.identify.forms import (
+    Evidence,
     Form,
     add_dead_zones,
     add_reverse_gains,
@@ -29,10 +29,12 @@ from nics_drl_bridge.identify.identify import (
     find_input_curves,
     run,
 )
+from nics_drl_bridge.identify.terms import Kind, Library
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.taylor import TaylorModel
 
+MOTION = Library(slipping_car(duration=4.0)[0], Kind.MOTION, True, 1.0, 3)
 CURVE = InputCurve(command="throttle", dead=0.05, least=-0.3, most=0.5)
 
 
@@ -50,9 +52,10 @@ def samples(found) -> Samples:
     return resample_drive(found.training, found)
 
 
-def form_inputs(found, samples, form):
+@pytest.fixture(scope="module")
+def evidence(found, samples) -> Evidence:
     calibration = replace(found.calibration, command_latency_s=0.05)
-    return list_parameters(found.training, calibration, samples, form)
+    return Evidence(found.training, calibration, samples, MOTION)
 
 
 def test_a_dead_zone_is_seen_in_the_speed_that_a_throttle_makes(found, samples):
@@ -80,9 +83,9 @@ def test_a_command_that_does_not_drive_a_robot_has_no_curve_by_its_speed(
     assert find_input_curve(slower, found.training.spec, 1) is None
 
 
-def test_values_are_sought_by_name_from_what_the_motion_shows(found, samples):
+def test_values_are_sought_by_name_from_what_the_motion_shows(evidence):
     form = Form((CURVE,), friction=("vx",), limits=("vx",), drag=("vx",))
-    sought = form_inputs(found, samples, form)
+    sought = list_parameters(evidence, form)
     assert sought.names == (
         "latency",
         "throttle.dead",
@@ -99,72 +102,68 @@ def test_values_are_sought_by_name_from_what_the_motion_shows(found, samples):
     assert (sought.start <= sought.high).all()
 
 
-def test_a_form_that_grows_starts_where_the_smaller_one_ended(found, samples):
-    small = form_inputs(found, samples, Form((CURVE,)))
+def test_a_form_that_grows_starts_where_the_smaller_one_ended(evidence):
+    small = list_parameters(evidence, Form((CURVE,)))
     ended = replace(small, start=small.start + np.array([0.02, 0.01, 0.0, 0.03]))
-    larger = form_inputs(found, samples, Form((CURVE,), drag=("vx",))).start_from(ended)
+    larger = list_parameters(evidence, Form((CURVE,), drag=("vx",))).start_from(ended)
     assert larger.start[:4] == pytest.approx(ended.start)
     assert larger.start[4] > 0.0
 
 
-def test_the_least_delay_of_the_commands_is_their_latency(found, samples):
+def test_the_least_delay_of_the_commands_is_their_latency(evidence):
     form = Form((CURVE,), delays=(("throttle", 0.08), ("steering", 0.02)))
-    sought = form_inputs(found, samples, form)
+    sought = list_parameters(evidence, form)
     assert sought.names[:3] == ("latency", "throttle.delay", "steering.delay")
     assert 0 not in sought.sought
-    assert form.latency_at(sought, sought.start) == 0.02
-    (curve,) = form.curves_at(sought, sought.start)
+    at = sought.name(sought.start)
+    assert form.find_latency(at) == 0.02
+    (curve,) = form.make_curves(at)
     assert (curve.command, curve.delay) == ("throttle", pytest.approx(0.06))
-    delayed = make_prediction_problem(
-        found.training, Calibration(), samples, form, sought
-    ).commands(sought.start)
-    shared = replace(
-        sought, start=np.where(np.arange(len(sought.start)) == 1, 0.02, sought.start)
-    )
-    alike = make_prediction_problem(
-        found.training, Calibration(), samples, form, shared
-    ).commands(shared.start)
-    step = round(0.06 / samples.dt)
+    problem = make_prediction_problem(evidence, form, sought)
+    delayed = problem.commands(at)
+    alike = problem.commands(at | {"throttle.delay": 0.02})
+    step = round(0.06 / evidence.samples.dt)
     assert delayed[step:, 0] == pytest.approx(alike[:-step, 0])
     assert np.array_equal(delayed[:, 1], alike[:, 1])
 
 
-def test_values_become_curves_friction_limits_and_drag(found, samples):
+def test_values_become_curves_friction_limits_and_drag(evidence):
     form = Form((CURVE,), ("vx",), ("vx",), ("throttle",), ("vx",))
-    sought = form_inputs(found, samples, form)
+    sought = list_parameters(evidence, form)
     values = np.array([0.03, 0.12, -0.2, 0.4, 0.8, 0.25, 0.15, 1.2, 3.0, 2.0])
-    (curve,) = form.curves_at(sought, values)
+    at = sought.name(values)
+    (curve,) = form.make_curves(at)
     assert curve == InputCurve(
         command="throttle", dead=0.12, least=-0.2, most=0.4, back=0.8
     )
-    spec = found.training.spec
-    model = form.actuated(make_model(spec, {"vx": {"vx": 1.0}}), sought, values)
+    spec = evidence.drive.spec
+    model = form.actuate(make_model(spec, {"vx": {"vx": 1.0}}), at)
     assert model.friction.tolist() == [0.25, 0.0, 0.0]
     assert model.drag.tolist() == [0.15, 0.0, 0.0]
     assert model.back_emf[0].tolist() == [1.2, 0.0]
     assert model.limits[0].tolist() == [-3.0, 2.0]
 
 
-def test_a_dead_zone_is_tried_of_the_command_that_drives_alone(found, samples):
-    (curve,) = add_dead_zones(Form(), found.training, samples).curves
+def test_a_dead_zone_is_tried_of_the_command_that_drives_alone(evidence):
+    (curve,) = add_dead_zones(Form(), evidence).curves
     assert curve.command == "throttle"
     assert 0.0 < curve.dead < 0.05
-    assert add_dead_zones(Form((CURVE,)), found.training, samples).curves == (CURVE,)
-    assert add_reverse_gains(
-        add_dead_zones(Form(), found.training, samples), (curve,)
-    ).back == ("throttle",)
+    assert add_dead_zones(Form((CURVE,)), evidence).curves == (CURVE,)
+    assert add_reverse_gains(add_dead_zones(Form(), evidence), (curve,)).back == (
+        "throttle",
+    )
 
 
 def test_only_a_command_that_drives_both_ways_may_have_a_gain_of_its_own_backwards(
-    found, samples
+    evidence,
 ):
-    (both,) = find_two_way_curves(found.training, samples)
+    (both,) = find_two_way_curves(evidence)
     assert both.command == "throttle"
     form = add_reverse_gains(Form(), (both,))
     assert form.back == ("throttle",)
-    assert len(form_inputs(found, samples, form).sought) == 4  # it has no dead zone
-    forwards = replace(samples, x=np.abs(samples.x))
-    assert find_two_way_curves(found.training, forwards) == ()
+    assert len(list_parameters(evidence, form).sought) == 4  # it has no dead zone
+    forwards = replace(evidence.samples, x=np.abs(evidence.samples.x))
+    assert find_two_way_curves(replace(evidence, samples=forwards)) == ()
 
 
 def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, samples):

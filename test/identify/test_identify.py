@@ -8,10 +8,10 @@ import pytest
 
 from identify.drives import drive, make_model, with_values
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import Identified, cut, identify
 from nics_drl_bridge.identify.open_loop import predict, select_windows
+from nics_drl_bridge.identify.textbook_model import assume_textbook
 from nics_drl_bridge.robot.spec import RobotSpec, build_robot, load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
 

@@ -13,11 +13,10 @@ from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.generator import generate, mount_lidar
 from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify, join_recordings
-from nics_drl_bridge.identify.report import format_report
-from nics_drl_bridge.identify.shooting import Shooting
+from nics_drl_bridge.identify.report import conclude, format_report
+from nics_drl_bridge.identify.shooting import Parameters, Shooting
 from nics_drl_bridge.identify.verdict import (
     Alone,
     describe_gaps,
@@ -74,26 +73,17 @@ def together():
     return generate([STRAIGHT, TURNING], ROBOT, mount_lidar(ROBOT), (), strict=True)
 
 
-def test_no_prediction_window_crosses_from_one_drive_to_another():
-    joined = join_recordings([STRAIGHT, TURNING], ROBOT)
-    drive = Drive(joined, ROBOT)
-    for horizon in (0.5, 2.0, 5.0):
-        chosen = open_loop.select_windows(
-            drive, Calibration(), 0.0, drive.duration_s, horizon, 0.1
-        )
-        assert len(chosen.start_t) > 50
-        ends = joined.episode_at(chosen.end_t)
-        assert np.array_equal(joined.episode_at(chosen.start_t), ends)
-        assert set(ends) == {0, 1, 2, 3}
-
-
 @pytest.mark.slow
 def test_no_window_of_the_fit_crosses_either(together):
     _, identified = together
     samples = identified.samples
     recording = identified.recording
     problem = Shooting(
-        samples, lambda _: samples.x, lambda model, _: model, lambda *_: np.ones(3)
+        samples,
+        Parameters((), *np.zeros((4, 0))),
+        lambda _: samples.x,
+        lambda model, _: model,
+        lambda *_: np.ones(3),
     )
     first, steps = problem.list_windows()
     at = recording.episode_at(samples.t)

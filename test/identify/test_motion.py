@@ -9,11 +9,9 @@ import pytest
 from scipy.signal import savgol_filter
 
 from identify.drives import slipping_car
-from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.motion import (
+from nics_drl_bridge.identify.calibration import (
     WIDTHS_S,
+    Calibration,
     add_motion,
     choose_half_width,
     find_slopes,
@@ -24,6 +22,8 @@ from nics_drl_bridge.identify.motion import (
     resample_motion,
     smooth_commands,
 )
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import build_robot, load_robot

@@ -12,9 +12,8 @@ import pytest
 
 from identify import planted
 from nics_drl_bridge.errors import BridgeError
-from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.report import explain_uselessness, format_report
+from nics_drl_bridge.identify.report import conclude, explain_uselessness, format_report
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -76,6 +75,7 @@ ALIKE = {
     "both encoders backwards",
     "15 values",
     "a long drive",
+    "rows twice",
 }
 ALIKE_WITHOUT_STATE = {"pose in feet", "speed in km/h", "turn to the other side"}
 

@@ -10,7 +10,6 @@ import pytest
 from identify.drives import make_model, slipping_car
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.shooting import (
-    NO_PARAMETERS,
     Parameters,
     Shooting,
     fit_to_predictions,
@@ -57,17 +56,20 @@ def problem(car) -> Shooting:
     samples = Samples(t, q, np.vstack([x, x[-1:]]), np.gradient(q, DT, axis=0), DT)
 
     def commands(values):
-        at = np.arange(STEPS + 1) - values[0] / DT
+        at = np.arange(STEPS + 1) - values["latency"] / DT
         return np.stack(
             [np.interp(at, np.arange(STEPS), column) for column in command.T], axis=1
         )
 
-    return Shooting(samples, commands, lambda model, values: model, equally)
+    return Shooting(samples, DELAYS, commands, lambda model, values: model, equally)
 
 
-DELAYS = Parameters(
-    ("latency",), *(np.array([value]) for value in (0.05, 0.05, 0.0, 0.4))
-)
+def parameters(**rows: tuple[float, float, float, float]) -> Parameters:
+    """Parameters with their start, scale and bounds."""
+    return Parameters(tuple(rows), *np.array(list(rows.values())).T)
+
+
+DELAYS = parameters(latency=(0.05, 0.05, 0.0, 0.4))
 
 
 def test_coefficients_and_a_delay_are_found_together(car, problem):
@@ -75,12 +77,12 @@ def test_coefficients_and_a_delay_are_found_together(car, problem):
         car, coefficients=car.coefficients * np.where(car.coefficients == 1.0, 1.0, 1.3)
     )
     free = (car.coefficients != 0.0) & (np.arange(6) >= 3)[:, None]
-    found = fit_to_predictions(problem, off, free, DELAYS)
+    found = fit_to_predictions(problem, off, free)
     assert found.model.coefficients[free] == pytest.approx(
         car.coefficients[free], rel=0.02
     )
     assert found.values[0] == pytest.approx(DELAY, abs=0.003)
-    assert found.value_errors[0] < 0.01
+    assert found.errors["latency"] < 0.01
 
 
 def test_windows_that_are_predicted_together_end_as_each_alone(car, problem):
@@ -108,12 +110,10 @@ def test_windows_that_are_predicted_together_end_as_each_alone(car, problem):
 
 
 def test_a_value_between_equal_bounds_stays_and_has_no_error(car, problem):
-    known = replace(
-        DELAYS, start=np.array([0.08]), low=np.array([0.08]), high=np.array([0.08])
-    )
-    found = fit_to_predictions(problem, car, car.coefficients == 4.0, known)
-    assert found.values.tolist() == [0.08]
-    assert np.isnan(found.value_errors).all()
+    known = replace(problem, parameters=parameters(latency=(0.08, 0.05, 0.08, 0.08)))
+    found = fit_to_predictions(known, car, car.coefficients == 4.0)
+    assert found.named == {"latency": 0.08}
+    assert np.isnan(found.errors["latency"])
 
 
 def test_rows_outside_are_neither_started_from_nor_passed(problem):
@@ -136,18 +136,19 @@ def test_a_window_does_not_pass_a_gap(problem):
 def test_predictions_are_seen_from_where_the_tracked_body_is(car, problem):
     first, steps = problem.list_windows()
     values = np.array([DELAY, 0.2, -0.1, 0.3])
-    base, _ = problem.predict(car, values, first, steps)
-    seen, _ = replace(problem, mounted=True).predict(car, values, first, steps)
+    base, _ = problem.predict(car, values[:1], first, steps)
+    row = (0.0, 0.1, -1.0, 1.0)
+    mounted = parameters(latency=row, x=row, y=row, heading=row)
+    seen, _ = replace(problem, parameters=mounted).predict(car, values, first, steps)
     mounting = values[1:]
     expected = geometry.between(mounting, geometry.compose(base, mounting))
     assert seen[..., :2] == pytest.approx(expected[..., :2])
 
 
 def test_nothing_free_leaves_the_model(car, problem):
-    fixed = replace(problem, fixed=np.array([DELAY]))
-    found = fit_to_predictions(
-        fixed, car, np.zeros((6, 4), dtype=np.bool_), NO_PARAMETERS
-    )
+    fixed = parameters(latency=(DELAY, 0.05, 0.0, 0.4)).freeze()
+    problem = replace(problem, parameters=fixed)
+    found = fit_to_predictions(problem, car, np.zeros((6, 4), dtype=np.bool_))
     assert np.array_equal(found.model.coefficients, car.coefficients)
     assert np.sqrt(np.mean(found.residual**2)) < 0.005
 
@@ -166,8 +167,8 @@ def test_the_error_of_a_prediction_that_diverged_is_infinite_and_none_is_left_ou
 def test_delays_alone_move_to_later_stamps():
     names = ("latency", "throttle.delay", "throttle.dead")
     start = np.array([0.1, 0.2, 0.3])
-    parameters = Parameters(names, start, np.ones(3), start - 0.1, start + 0.1)
-    later = parameters.shift_stamps(0.05)
+    sought = Parameters(names, start, np.ones(3), start - 0.1, start + 0.1)
+    later = sought.shift_stamps(0.05)
     assert later.start == pytest.approx([0.05, 0.15, 0.3])
     assert later.low == pytest.approx([-0.05, 0.05, 0.2])
     assert later.high == pytest.approx([0.15, 0.25, 0.4])

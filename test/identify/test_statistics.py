@@ -6,7 +6,6 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.identify.excitation import list_commands_together
 from nics_drl_bridge.identify.fit import fit, parse_alpha
 from nics_drl_bridge.identify.statistics import (
     compute_condition,
@@ -76,7 +75,7 @@ def test_known_coefficients_lie_within_three_standard_errors(name):
     spec = load_robot(name)
     inside = []
     short = []
-    for seed in range(40):
+    for seed in range(15):
         result = fit(noisy_samples(spec, seed), spec, order=1, noisy=True)
         terms = result.model.named.terms
         errors = result.model.named_errors
@@ -142,7 +141,7 @@ def test_cross_validation_is_that_of_separate_fits():
             assert squares[block, n] == pytest.approx((rest**2).mean())
 
 
-@pytest.mark.parametrize("order", [1, 2, 3, 4])
+@pytest.mark.parametrize("order", [1, 4])
 def test_auto_keeps_what_is_worth_it_at_every_order(order):
     spec = load_robot("differential")
     result = fit(noisy_samples(spec, 1), spec, order=order, alpha="auto", noisy=True)
@@ -152,16 +151,6 @@ def test_auto_keeps_what_is_worth_it_at_every_order(order):
     for curve in result.curves:
         assert len(curve.error) == len(curve.terms) + 1
         assert curve.error[curve.kept] <= curve.error[0]
-
-
-def test_commands_that_move_apart_are_not_together():
-    spec = load_robot("differential")
-    samples = noisy_samples(spec, 5)
-    assert list_commands_together(samples, spec) == ()
-    x = samples.x.copy()
-    x[:, 3] = -1.5 * x[:, 2]
-    joined = Samples(samples.t, samples.q, x, samples.dq, samples.dt)
-    assert list_commands_together(joined, spec) == ("forward_command", "turn_command")
 
 
 @pytest.mark.parametrize("text", ["1.5", "-0.1", "nan", "automatic", ""])

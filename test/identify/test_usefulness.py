@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from identify.drives import drive, with_values
-from nics_drl_bridge.identify import acceptance
+from nics_drl_bridge.identify import judgement
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.open_loop import measure_open_loop_error
@@ -22,8 +22,7 @@ TOO_COARSE = "between rows that are 0.3 s apart, so record at a higher rate."
 
 THREE_ROBOTS = [
     "car",
-    "mecanum",
-    pytest.param("differential", marks=pytest.mark.campaign),
+    *(pytest.param(n, marks=pytest.mark.campaign) for n in ("mecanum", "differential")),
 ]
 
 
@@ -78,7 +77,7 @@ def test_standing_still_is_off_by_the_way_from_start_to_end(car):
 @pytest.fixture
 def no_textbook(monkeypatch):
     """Leaves a model as it is, however much better its textbook is."""
-    monkeypatch.setattr(acceptance, "is_beaten_by_textbook", lambda judgement: False)
+    monkeypatch.setattr(judgement, "is_beaten_by_textbook", lambda judgement: False)
 
 
 @pytest.mark.slow
@@ -138,7 +137,9 @@ def test_a_model_of_too_few_terms_is_not_put_down_to_the_recording(car):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_textbook")
-@pytest.mark.parametrize("name", ["car", "mecanum"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("car", marks=pytest.mark.campaign), "mecanum"]
+)
 def test_a_model_that_predicts_nothing_is_told_of_in_one_sentence(name, request):
     spec = request.getfixturevalue(name)
     recording = coarse(spec, every=30)
@@ -147,7 +148,7 @@ def test_a_model_that_predicts_nothing_is_told_of_in_one_sentence(name, request)
         found = identify(recording, spec)
         sentence = explain_uselessness(found)
     assert "is useless: on unseen data its predictions end" in sentence
-    assert found.verdict is acceptance.Verdict.DO_NOT_TRAIN
+    assert found.verdict is judgement.Verdict.DO_NOT_TRAIN
     ran_away = replace(found.held_out, mean_position_error_m=np.inf)
     sentence = explain_uselessness(replace(found, held_out=ran_away))
     assert "its predictions have diverged after 5 s" in sentence

@@ -12,7 +12,7 @@ from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import measure_timing
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.excitation import Excitation
+from nics_drl_bridge.identify.fit import Excitation
 from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.verdict import (
     describe_clocks,

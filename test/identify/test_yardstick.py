@@ -38,7 +38,7 @@ def without_a_textbook(spec):
     return RobotSpec(name="nameless", footprint_radius=0.2, command=tuple(commands))
 
 
-@pytest.mark.parametrize("kind", ["ackermann", "differential", "mecanum", "tricycle"])
+@pytest.mark.parametrize("kind", ["differential", "mecanum", "tricycle"])
 @pytest.mark.slow
 def test_a_fitted_textbook_predicts_a_robot_of_its_kind(kind):
     spec = load_robot(kind)
@@ -91,16 +91,6 @@ def test_a_drive_too_short_to_learn_from_is_refused():
         RecordingError, match="contain no window of 5 s; record a longer drive"
     ):
         fit_yardstick(Drive(drive(spec, duration=6.0), spec), 4.0)
-
-
-@pytest.mark.parametrize("kind", ["ackermann", "differential"])
-def test_a_jump_of_the_localiser_does_not_lead_it_astray(kind):
-    spec = load_robot(kind)
-    clean = drive(spec, duration=30.0, noise=MOCAP)
-    jumped = clean.pose.values + 50.0 * np.outer(clean.pose.t > 15.0, [1.0, 1.0, 0.0])
-    driven = Drive(with_values(clean, pose=jumped), spec)
-    chosen = held_out(driven)
-    assert share(fit_yardstick(driven, LEARNT_S).predict(driven, chosen), chosen) < 0.03
 
 
 @pytest.mark.parametrize("values", [0.0, 1e-3])

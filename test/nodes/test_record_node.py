@@ -15,7 +15,7 @@ from nav_msgs.msg import Odometry
 from robots import open_field
 
 from nics_drl_bridge.generator import builtin_model, save_model
-from nics_drl_bridge.identify.excitation import measure_coverage
+from nics_drl_bridge.identify.fit import measure_coverage
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.nodes import conversions, qos, record_node
 from nics_drl_bridge.recording.readers import read_recording

@@ -7,7 +7,7 @@ from steps import integrate
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.identify.excitation import (
+from nics_drl_bridge.identify.fit import (
     list_commands_together,
     list_unmoved_variables,
 )

@@ -82,7 +82,7 @@ def test_a_short_drive_has_fewer_pictures():
 def predicted(identified, kind: Kind):
     """The result of a drive whose terms predictions chose from a kind of library."""
     library = Library(identified.drive.spec, kind, True, "auto", 3)
-    draft = Draft(library, form=None, parameters=None, problem=None)
+    draft = Draft(library, form=None, problem=None)
     base = Base(draft, found=None)
     return replace(identified, findings=replace(identified.findings, base=base))
 
