@@ -32,7 +32,7 @@ from nics_drl_bridge.recording.heading import (
 from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.recording.recording import HeadingKeys, Recording
 from nics_drl_bridge.recording.stamping import select_new_rows
-from nics_drl_bridge.robot.kinds import has_textbook, textbook
+from nics_drl_bridge.robot.kinds import has_textbook, slips, textbook
 from nics_drl_bridge.robot.spec import FARTHEST_STEERED, RobotSpec
 
 # number of samples on either side whose median difference measures a jump
@@ -74,6 +74,7 @@ ALIKE = 0.85
 NEAR = 1.2
 # ratio to the commanded speed that is not just slip or a worn wheel
 SCALED = 1.5
+MOST_SKID = 6.0  # ratio of the commanded to the measured turn up to which a robot skids
 # a pose that stays within these,
 STANDING_M = 1e-3
 STANDING_RAD = 2e-3
@@ -414,8 +415,19 @@ def check_commands(
         if alike[place, place] <= ALIKE or unit not in CONFUSED:
             continue
         ratio = float(asked[:, place].std() / max(driven[:, place].std(), 1e-9))
-        notes += _describe_ratio(name, unit, ratio)
+        is_turn = unit == "rad/s" and len(places) == 2
+        if is_turn and slips(spec) and SCALED < ratio < MOST_SKID:
+            notes.append(_describe_skid(spec, ratio))
+        else:
+            notes += _describe_ratio(name, unit, ratio)
     return tuple(notes)
+
+
+def _describe_skid(spec: RobotSpec, ratio: float) -> str:
+    """Describes how much less a robot turns than its wheels ask for, because it skids."""
+    effective_track = ratio * spec.parameters["track"]
+    finding = f"The robot turns {1.0 / ratio:.2g} times as fast as commanded, because it skids"
+    return f"{finding}; in its file, `effective_track: {effective_track:.3g}` says so."
 
 
 def _describe_ratio(name: str, unit: str, ratio: float) -> Iterator[str]:
