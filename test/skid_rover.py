@@ -14,7 +14,6 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec, build_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
-from nics_drl_bridge.sim.world import World
 
 FOOTPRINT = [[0.45, 0.34], [-0.45, 0.34], [-0.45, -0.34], [0.45, -0.34]]
 PILLARS = (
@@ -112,23 +111,6 @@ def rover_model() -> SimulatorModel:
     radii = sorted({radius for _, _, radius in PILLARS})
     table = bake(lidar, tuple(Circle(radius=radius) for radius in radii))
     return SimulatorModel(rover(), kinematics(), Calibration(), lidar, table, Noise())
-
-
-def pillars() -> World:
-    """A walled field of 12 x 12 m with the pillars."""
-    groups = [
-        {"shapes": [{"kind": "circle", "radius": radius}], "at": [[x, y, 0.0]]}
-        for x, y, radius in PILLARS
-    ]
-    return World.model_validate(
-        {
-            "name": "pillars",
-            "size": [12.0, 12.0],
-            "obstacles": groups,
-            "clearance": 0.1,
-            "goal_distance": [2.0, 5.0],
-        }
-    )
 
 
 def limits_in(folder: Path) -> str:

@@ -13,6 +13,7 @@ from command_line import nics, split_words
 from domains import claimed_domain
 
 from nics_drl_bridge import defaults, geometry
+from nics_drl_bridge.commands.vehicle_goals import GoalOrder
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.spec import load_robot
@@ -192,18 +193,17 @@ def test_a_goal_lies_where_it_was_given_wherever_odometry_began(
     from nics_drl_bridge.commands import episodes as vehicle
 
     said = []
-    options = {"start": "present", "stale_after_s": DEADLINE_S, "stamped": True}
+    options = {"stale_after_s": DEADLINE_S, "stamped": True}
     order = vehicle_order(tmp_path / "out")
 
-    def drive(goal, **more):
-        return vehicle.drive_vehicle(
-            order, goal, False, said.append, said.append, **options, **more
-        )
+    def drive(goal, frame=None):
+        goals = GoalOrder(goal, frame, "present")
+        return vehicle.drive_vehicle(order, goals, said.append, said.append, **options)
 
     # In the map it is far away, which nobody has confirmed.
     far = r"\(2.00 m, 0.50 m\) in map, 16.\d+ m from where it stands, farther than 5 m.*use --yes"
     with pytest.raises(ConfigError, match=far):
-        drive((2.0, 0.5), goal_frame="map")
+        drive((2.0, 0.5), "map")
     witnessed = far_from_the_origin.path
     assert np.ptp(witnessed[:, :2], axis=0).max() < 0.01
     assert witnessed[0] == pytest.approx([18.0, 5.0, 2.0], abs=0.1)
@@ -271,7 +271,6 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monke
     order = vehicle.EvaluationOrder(
         ["dynamic_window"], out, "differential", "empty", 1, 0
     )
-    options = {"start": "present", "stale_after_s": DEADLINE_S}
     with claimed_domain() as domain_id:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -284,7 +283,12 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monke
             with Witness(domain_id) as witness:  # it may be compiling
                 assert witness.sees(DEADLINE_S)
             made = vehicle.drive_vehicle(
-                order, None, True, said.append, said.append, **options
+                order,
+                GoalOrder(start="present"),
+                said.append,
+                said.append,
+                arm=True,
+                stale_after_s=DEADLINE_S,
             )
     assert "  command_gate is armed" in said
     assert any("it will drive to" in line for line in said)

@@ -2,8 +2,7 @@
 
 import json
 import platform
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from typer import Argument, Option
+from typer import Option
 
 from nics_drl_bridge import __version__, defaults, extensions
 from nics_drl_bridge.commands import console
@@ -30,13 +29,7 @@ COMPUTED_WITH = ("numpy", "numba", "scipy", "onnxruntime")
 
 
 def assure(
-    policy: Annotated[
-        str,
-        Argument(
-            autocompletion=console.POLICIES,
-            help="A policy file, or the name of a shipped one.",
-        ),
-    ],
+    policy: console.PolicyFileArgument,
     limits: Annotated[
         str,
         Option(
@@ -47,24 +40,19 @@ def assure(
     model: console.PolicyModelOption = None,
     world: Annotated[
         list[str] | None,
-        Option(
-            "--world",
-            "--scene",
-            autocompletion=console.WORLDS,
-            help="A shipped world or a YAML file; repeatable; arena, clutter and crowd.",
+        console.make_world_option(
+            "A shipped world or a YAML file; repeatable; arena, clutter and crowd."
         ),
     ] = None,
     episodes: Annotated[
         int, Option(min=1, help="Number of episodes in process.")
     ] = defaults.ASSURANCE_EPISODES,
-    seed: Annotated[
-        int, Option(min=0, help="Seed of the first episode.")
-    ] = defaults.EVALUATION_SEED,
+    seed: console.FirstSeedOption = defaults.EVALUATION_SEED,
     randomisation: Annotated[
         str,
         Option(
             autocompletion=console.complete_names("randomisation"),
-            help="Drawn in each episode of the policy: a shipped one or a YAML file.",
+            help="Drawn for each episode of the policy: a shipped one or a YAML file.",
         ),
     ] = defaults.ASSURANCE_RANDOMISATION,
     faults: Annotated[
@@ -195,7 +183,7 @@ def _drive(run: "Run", out: Path) -> dict[str, Any]:
             out / runs.LOG,
             list(order.list_trials()),
             partial(map, run.drive),
-            _tell_left("episodes", advance),
+            partial(advance, "episodes"),
         )
         faults = order.list_faults()
         if faults:
@@ -205,30 +193,12 @@ def _drive(run: "Run", out: Path) -> dict[str, Any]:
                 out / runs.FAULT_LOG,
                 faults,
                 partial(inject_trials, order, out / "logs", say),
-                _tell_left("faults", advance),
+                partial(advance, "faults"),
             )
     results = summarise(rows, len(faults))
     runs.write_result(out, order, complete=True, **results)
     write_text(out / PAGE, make_assurance_page(order, results, str(out)))
     return results
-
-
-def _tell_left(what: str, advance: console.Tell) -> Callable[[int, int], None]:
-    """Returns a function that shows the progress and the remaining time."""
-    begun: list[tuple[float, int]] = []
-
-    def tell(done: int, total: int) -> None:
-        if not begun:
-            begun.append((time.monotonic(), done))
-        begun_s, first = begun[0]
-        left = ""
-        if done > first:
-            left_s = (time.monotonic() - begun_s) / (done - first) * (total - done)
-            minutes = round(left_s / 60.0)
-            left = f", {minutes // 60} h {minutes % 60:02} min left"
-        advance(f"{what}{left}", done, total)
-
-    return tell
 
 
 def _replay(run: "Run", seed: int, out: Path, as_json: bool) -> None:

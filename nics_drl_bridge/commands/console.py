@@ -2,7 +2,6 @@
 
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
-from typer import Option
+from typer import Argument, Option
 
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands.interrupts import was_interrupted
@@ -94,6 +93,14 @@ LidarOption = Annotated[
 WorldOption = Annotated[
     str, make_world_option(f"A shipped world ({defaults.WORLD}) or a YAML file.")
 ]
+PolicyFileArgument = Annotated[
+    str,
+    Argument(
+        autocompletion=POLICIES, help="A policy file, or the name of a shipped one."
+    ),
+]
+FirstSeedOption = Annotated[int, Option(min=0, help="Seed of the first episode.")]
+SeedOption = Annotated[int, Option(min=0, help="Seed of the episode.")]
 JsonOption = Annotated[bool, Option("--json", help="Print one JSON object instead.")]
 TopicsOption = Annotated[
     Path | None, Option(help="YAML file: a bag's topic for each role.")
@@ -109,7 +116,7 @@ RandomisationOption = Annotated[
     str | None,
     Option(
         autocompletion=complete_names("randomisation"),
-        help="Drawn in each episode: a shipped one (mild) or a YAML file.",
+        help="Drawn for each episode: a shipped one (mild) or a YAML file.",
     ),
 ]
 TaskOption = Annotated[
@@ -311,46 +318,61 @@ def format_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def show_progress(begin: str = "starting") -> Iterator[Tell]:
     """Yields a function that updates a progress bar or, without a terminal, prints some lines."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     console = Console(stderr=True)
-    if not console.is_terminal:
-        with _print_progress_lines(begin) as tell:
-            yield tell
-        return
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task(begin, total=None)
+    progress = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    task = progress.add_task(begin, total=None)
 
-        def show(text: str) -> None:
-            progress.update(task, description=text)
+    def tell(what: str, done: int = 0, total: int = 0) -> None:
+        progress.update(task, description=what, completed=done, total=total or None)
 
-        with STATUS.shown_by(show):
-            yield lambda what, done, total: progress.update(
-                task, description=what, completed=done, total=total or None
-            )
+    def show(text: str) -> None:
+        progress.update(task, description=text)
+
+    is_shown = (
+        STATUS.shown_by(show) if console.is_terminal else _print_progress(progress)
+    )
+    with progress, is_shown:
+        yield tell
 
 
 @contextmanager
-def _print_progress_lines(begin: str) -> Iterator[Tell]:
-    line = begin
+def _print_progress(progress: Any) -> Iterator[None]:
+    """Prints a line about the only task of a `rich` progress now and then."""
+    task = progress.tasks[0]
     ended = threading.Event()
-    begun_s = time.monotonic()
-
-    def tell(what: str, done: int, total: int) -> None:
-        nonlocal line
-        line = f"{what}, {done:,} of {total:,}" if total else what
 
     def print_lines() -> None:
         patience_s = PATIENCE_S
         while not ended.wait(patience_s):
             patience_s = REPEATED_S
-            typer.echo(f"{line} ({time.monotonic() - begun_s:.0f} s)", err=True)
+            line = task.description
+            if task.total:
+                line += f", {task.completed:,} of {task.total:,}"
+            if task.time_remaining:
+                minutes = round(task.time_remaining / 60.0)
+                line += f", {minutes // 60} h {minutes % 60:02} min left"
+            typer.echo(f"{line} ({task.elapsed:.0f} s)", err=True)
 
     thread = threading.Thread(target=print_lines, daemon=True)
     thread.start()
     try:
-        yield tell
+        yield
     finally:
         ended.set()
         thread.join()

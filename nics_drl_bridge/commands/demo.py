@@ -36,9 +36,10 @@ def demo(
     as_json: console.JsonOption = False,
 ) -> None:
     """Runs the whole chain once, from a recording to a report."""
-    from nics_drl_bridge.commands.demo_run import DemoPlan, run
+    from nics_drl_bridge.commands.demo_report import DemoPlan
+    from nics_drl_bridge.commands.demo_run import Demo
 
     console.tell_replaced(out / "report.html")
     plan = DemoPlan(out, robot, world, recording, episodes, policy, train_steps)
-    line = run(plan, partial(typer.echo, err=as_json))
+    line = Demo(plan, partial(typer.echo, err=as_json)).run()
     console.print_line(as_json, line, told=line, report=str(out / "report.html"))

@@ -22,7 +22,7 @@ LOAD_NOTE = (
 
 def doctor(
     bag: Annotated[
-        Path | None, Argument(help="A bag to check; else the live robot.")
+        Path | None, Argument(help="A bag to check; by default the live robot.")
     ] = None,
     model: Annotated[
         str | None,

@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium
 
 from nics_drl_bridge import defaults, extensions
-from nics_drl_bridge.commands.vehicle_goals import NEAR_M, GoalOrder
+from nics_drl_bridge.commands.vehicle_goals import NEAR_M, GoalOrder, VehicleEpisode
 from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import make_backend
@@ -21,8 +21,7 @@ from nics_drl_bridge.errors import BackendError, ConfigError, suggest
 from nics_drl_bridge.files import format_json, write_bytes, write_text
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel, open_model, save_model
-from nics_drl_bridge.interface import Backend
-from nics_drl_bridge.nodes.parameters import NO_POSE
+from nics_drl_bridge.interface import Array, Backend
 from nics_drl_bridge.policy import evaluation
 from nics_drl_bridge.policy.evaluation import Episode, Tally, drive, drive_all
 from nics_drl_bridge.policy.file.contract import Contract
@@ -36,7 +35,7 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
-from nics_drl_bridge.sim.scenes import sample_scene
+from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 FAST = "fast"
@@ -508,13 +507,11 @@ def _drive_again(
 
 def drive_vehicle(
     order: EvaluationOrder,
-    goal: tuple[float, float] | None,
-    arm: bool,
+    goals: GoalOrder,
     say: Say,
     ask: Say,
-    goal_frame: str | None = None,
     confirm: Say | None = None,
-    confirm_beyond_m: float = defaults.CONFIRMED_BEYOND_M,
+    arm: bool = False,
     **options: Any,
 ) -> Evaluated:
     """Drives episodes on the vehicle and in the fast simulator, and compares them.
@@ -522,70 +519,72 @@ def drive_vehicle(
     Commands go to `cmd_vel_raw`, and so through an armed gate. The fast simulator starts at the
     vehicle's actual starting poses. `ask` gets each start and returns when the episode may begin.
     `confirm` gets each goal beyond a distance limit and returns if the vehicle may drive there;
-    without `confirm`, such a goal is refused. Goals are relative to the start or in `map`, see
-    `GoalOrder`. Raises BackendError if the vehicle does not answer or does not fit its model,
-    ConfigError if a goal is refused.
+    without `confirm`, such a goal is refused. Raises BackendError if the vehicle does not answer or
+    does not fit its model, ConfigError if a goal is refused.
     """
     policy = order.policies[0]
     contracts = read_contracts(order.policies, order.model)
     name = model_name(order.model, contracts)
-    namespace = options.get("namespace", "")
     model = open_model(name)
     world = load_worlds(order.world)
-    localised = options.get("pose_type", defaults.POSE_TYPE) != NO_POSE
-    start = options.get("start", defaults.VEHICLE_START)
-    goals = GoalOrder(goal, goal_frame, start, localised, confirm_beyond_m)
     radius = model.robot.footprint_radius
+    scenes = [sample_scene(world, radius, seed) for seed in order.seeds]
     if not goals.needs_pose:  # refuse far goals before the operator has to wait
-        planned = [
-            goals.episode(sample_scene(world, radius, seed)) for seed in order.seeds
-        ]
-        farthest = max(planned, key=lambda episode: episode.distance)
-        farthest.confirm(confirm)
-    limited = limit_time(order.conditions, contracts, model, world, say)
+        planned = map(goals.episode, scenes)
+        max(planned, key=lambda episode: episode.distance).confirm(confirm)
+    conditions = limit_time(order.conditions, contracts, model, world, say)
     # A policy that does not fit must be refused before anything moves.
-    open_policy(policy, model, order.conditions.kind)
+    open_policy(policy, model, conditions.kind)
+    namespace = options.get("namespace", "")
     _examine_vehicle(model, namespace, options.get("imu", defaults.IMU_TOPIC), say)
-    backend_options = {
-        "mode": "realtime",
-        "vehicle": True,
-        "command_topic": RAW,
-        "say": say,
-        **options,
-        "lays_map": goals.lays_map,
-    }
     ground = goals.ground(world)
-    backend = make_backend("dds", model, ground, **backend_options)
-    env, driver = make_env(backend, policy, model, ground, limited)
+    fixed = {"mode": "realtime", "vehicle": True, "command_topic": RAW, "say": say}
+    options |= {"start": goals.start, "lays_map": goals.lays_map}
+    backend = make_backend("dds", model, ground, **fixed, **options)
+    env, driver = make_env(backend, policy, model, ground, conditions)
     episodes = list[Episode]()
+    last = "" if arm else f"; arm {GATE}"
     with closing(env):
-        for count, seed in enumerate(order.seeds, 1):
-            scene = sample_scene(world, radius, seed)
-            present = backend.present_pose() if goals.needs_pose else None
-            episode = goals.episode(scene, present)
-            if goals.needs_pose:
-                episode.confirm(confirm)
-            last = "" if arm else f"; arm {GATE}"
-            ask(f"episode {count} of {order.episodes}: {episode.sentence()}{last}")
-            if goals.needs_pose:  # the vehicle may have been moved in the meantime
-                confirmed = episode.distance
-                episode = goals.episode(scene, backend.present_pose())
-                if episode.distance > confirmed + NEAR_M:
-                    episode.confirm(confirm)
-            driven = drive(
-                env, driver, seed, episode.options, partial(_arm, arm, namespace, say)
+        for seed, scene in zip(order.seeds, scenes, strict=True):
+            question = f"episode {len(episodes) + 1} of {order.episodes}: {{}}{last}"
+            episode = _agree_on_episode(
+                goals, scene, backend.present_pose, question, ask, confirm
             )
+            begin = partial(_arm, arm, namespace, say)
+            driven = drive(env, driver, seed, episode.options, begin)
             # Only the vehicle's own estimate of its path is known.
             episodes.append(replace(driven, path=driven.estimate))
             say(f"  {report_end(episodes[-1])}")
     runs = {VEHICLE: episodes}
     try:
-        runs[FAST] = _drive_again(episodes, policy, model, order.world, limited)
+        runs[FAST] = _drive_again(episodes, policy, model, order.world, conditions)
     except ConfigError as error:  # the start may be inside a wall of the map
         say(f"  not driven again in process: {error}")
     result = judge_runs(policy, runs, model, world, order.out)
-    write_evaluation(replace(order, conditions=limited), name, model, [result])
+    write_evaluation(replace(order, conditions=conditions), name, model, [result])
     return result
+
+
+def _agree_on_episode(
+    goals: GoalOrder,
+    scene: Scene,
+    find_pose: Callable[[], Array],
+    question: str,
+    ask: Say,
+    confirm: Say | None,
+) -> VehicleEpisode:
+    """Asks for the start of an episode, and for confirmation of a far goal; returns it."""
+    if not goals.needs_pose:
+        episode = goals.episode(scene)
+        ask(question.format(episode.sentence()))
+        return episode
+    asked = goals.episode(scene, find_pose())
+    asked.confirm(confirm)
+    ask(question.format(asked.sentence()))
+    episode = goals.episode(scene, find_pose())
+    if episode.distance > asked.distance + NEAR_M:  # it was moved in the meantime
+        episode.confirm(confirm)
+    return episode
 
 
 ENDS_BELIEVED = {"success": "reached", "collision": "touched"}

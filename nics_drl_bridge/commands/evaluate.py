@@ -49,9 +49,7 @@ def evaluate(
             help=f"Number of episodes; {defaults.EVALUATION_EPISODES}, or 1 on a vehicle.",
         ),
     ] = None,
-    seed: Annotated[
-        int, Option(min=0, help="Seed of the first episode.")
-    ] = defaults.EVALUATION_SEED,
+    seed: console.FirstSeedOption = defaults.EVALUATION_SEED,
     lidar: console.OtherLidarOption = None,
     randomisation: console.RandomisationOption = None,
     gate: console.GateOption = None,
@@ -149,20 +147,24 @@ def evaluate(
     )
     console.tell_replaced(out / driving.EVALUATION)
     if hardware:
-        options: dict[str, Any] = {
-            "start": start,
-            "namespace": namespace,
-            "pose_type": pose_type,
-            "imu": imu,
-            "goal_frame": goal_frame,
-            "confirm": partial(_confirm, yes),
-            "confirm_beyond_m": confirm_beyond,
-        }
-        driven = partial(
-            driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes)
+        from nics_drl_bridge.commands.vehicle_goals import GoalOrder
+
+        goals = GoalOrder(
+            place, goal_frame, start, pose_type != defaults.POSE_TYPE, confirm_beyond
         )
         with extensions.require_modules("nics evaluate --hardware"):
-            evaluated = [driven(**options)]
+            driven = driving.drive_vehicle(
+                order,
+                goals,
+                tell,
+                partial(_ask, yes),
+                partial(_confirm, yes),
+                arm,
+                namespace=namespace,
+                pose_type=pose_type,
+                imu=imu,
+            )
+        evaluated = [driven]
     else:
         with console.show_progress("opening robot and policies") as advance:
             evaluated = driving.evaluate(order, tell, advance)

@@ -1,11 +1,11 @@
-"""Quick checks of a command's names and files, which load no heavy library."""
+"""Checks of a command's names and files, before PyTorch or ROS 2 is loaded."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 
-from nics_drl_bridge.errors import ConfigError, ModelError, suggest
+from nics_drl_bridge.errors import ConfigError
 
 if TYPE_CHECKING:
     from nics_drl_bridge.recording.excite import DrivePlan
@@ -34,27 +34,6 @@ def check_suffix(option: str, file: Path, *suffixes: str) -> None:
     """Raises ConfigError unless a file to write has the first suffix, or one of the others."""
     if file.suffix not in suffixes:
         raise ConfigError(f"{option} {file}: must end in {suffixes[0]}.")
-
-
-def check_robot(name: str) -> None:
-    """Raises ConfigError or ModelError unless a robot or a model's folder can be opened."""
-    from nics_drl_bridge.config import list_shipped
-    from nics_drl_bridge.robot.spec import load_robot
-
-    shipped = list_shipped("robots")
-    if name in shipped or name.endswith((".yaml", ".yml")):
-        load_robot(name)
-        return
-    folder = Path(name)
-    if not folder.is_dir() and "/" in name:
-        raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
-    if not folder.is_dir():
-        fix = "or give a model's folder, or a robot's YAML file"
-        raise ModelError(f"unknown robot {name!r}; {suggest(name, shipped)} ({fix}).")
-    if not (folder / "model.yaml").is_file():
-        raise ModelError(
-            f"{folder}: contains no model.yaml; make a model with `nics generate`."
-        )
 
 
 def check_task(name: str) -> None:
@@ -89,7 +68,9 @@ def check_training(
             )
         check_writable(out / "settings.yaml")
     if robot is not None:
-        check_robot(robot)
+        from nics_drl_bridge.generator import open_model
+
+        open_model(robot)
     if task != "navigation":
         check_task(task)
     if worlds:

@@ -60,7 +60,7 @@ def install(
         installed = [source.name for source in sources if is_installed(source.name)]
         for name in installed:
             print_line(
-                as_json, f"{name} is installed already", package=name, prefix=None
+                as_json, f"{name} is already installed", package=name, prefix=None
             )
         sources = [source for source in sources if source.name not in installed]
     if not sources:

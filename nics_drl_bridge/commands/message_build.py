@@ -121,13 +121,13 @@ def read_source(folder: Path) -> Source:
         match = NAME_ELEMENT.search(read_text(manifest))
         name = match[1] if match else ""
     if not PACKAGE_NAME.fullmatch(name):
-        fix = "name the package in its package.xml, in lower case, as my_messages"
-        raise ConfigError(f"{folder}: {name!r} is no name of a package; {fix}.")
+        fix = "set a lower-case name in its package.xml, such as my_messages"
+        raise ConfigError(f"{folder}: {name!r} is not a valid package name; {fix}.")
     source = Source(name, folder)
     if not source.list_files():
         kinds = ", ".join(f"{kind}/*.{kind}" for kind in FOLDERS)
         fix = "give the folder of a package with messages"
-        raise ConfigError(f"{folder}: holds none of {kinds}; {fix}.")
+        raise ConfigError(f"{folder}: contains none of {kinds}; {fix}.")
     return source
 
 
@@ -145,8 +145,8 @@ def sort_by_use(sources: Sequence[Source]) -> list[Source]:
     try:
         order = list(TopologicalSorter(uses).static_order())
     except CycleError as error:
-        circle = " and ".join(sorted(set(error.args[1])))
-        raise ConfigError(f"{circle} need each other; break the circle.") from None
+        cycle = " and ".join(sorted(set(error.args[1])))
+        raise ConfigError(f"{cycle} depend on each other; break the cycle.") from None
     return [by_name[name] for name in order if name in by_name]
 
 
@@ -208,7 +208,7 @@ class Generators(AbstractContextManager["Generators", None]):
     def _install(self, wheels: Wheels) -> None:
         base = getattr(sys, "_base_executable", sys.executable)
         self._run(
-            [base, "-m", "venv", str(self._prefix)], "an environment can't be made"
+            [base, "-m", "venv", str(self._prefix)], "the environment can't be created"
         )
         pins = self._work / "pins.txt"
         lines = [f"{name}=={number}" for name, number in wheels.versions.items()]
@@ -255,7 +255,7 @@ class Generators(AbstractContextManager["Generators", None]):
         if not kept:
             needed_files = "msg/*.msg, srv/*.srv or action/*.action"
             raise ConfigError(
-                f"{source.folder}: holds no {needed_files} that could be built."
+                f"{source.folder}: contains no {needed_files} that can be built."
             )
         needed = {name for file in kept for name in source.find_used_packages(file)}
         if any(file.suffix == ".action" for file in kept):

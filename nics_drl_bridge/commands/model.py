@@ -25,6 +25,11 @@ if TYPE_CHECKING:
     from nics_drl_bridge.recording.survey import TableSurvey
 
 
+SourceArgument = Annotated[
+    Path, Argument(help="A bag, a table, or a folder of tables.")
+]
+
+
 def record(
     out: Annotated[
         Path, Option(help="An .npz file, or the folder of a rosbag2, to write.")
@@ -42,10 +47,10 @@ def record(
     seed: Annotated[int, Option(help="Seed of the pattern.")] = 0,
     namespace: console.NamespaceOption = "",
     remap: Annotated[
-        list[str] | None, Option(help="Rename a topic: odom:=/wheels.")
+        list[str] | None, Option(help="Rename a topic, as in odom:=/wheels.")
     ] = None,
     topics: Annotated[
-        Path | None, Option(help="YAML: joints of state and wheels.")
+        Path | None, Option(help="YAML file: joints of the state and of the wheels.")
     ] = None,
     stamped: Annotated[
         bool | None, Option(help="Send cmd_vel as TwistStamped.")
@@ -89,7 +94,10 @@ def record(
     typer.echo("\n".join(lines), err=as_json)
     if not yes and not typer.confirm("Drive the robot now?", err=as_json):
         console.print_line(
-            as_json, "nothing was driven or recorded.", **facts, recorded=False
+            as_json,
+            "the robot was not driven, and nothing was recorded.",
+            **facts,
+            recorded=False,
         )
         return
     with forward_errors():
@@ -163,11 +171,11 @@ def _print_table(table: "TableSurvey") -> None:
     typer.echo(f"{table.name}: {table.rows} rows{findings}")
     rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
     if rows:
-        typer.echo(console.format_table(("column", "least", "greatest"), rows))
+        typer.echo(console.format_table(("column", "minimum", "maximum"), rows))
 
 
 def inspect(
-    source: Annotated[Path, Argument(help="A bag, a table, or a folder of tables.")],
+    source: SourceArgument,
     mapping: Annotated[
         Path | None,
         Option("--map", help="YAML file to write: a draft mapping, with guesses."),
@@ -217,17 +225,19 @@ def inspect(
         )
         return
     if mapping is None:
-        typer.echo(f"A first mapping, to edit; --map FILE writes it:\n\n{draft.text}")
+        typer.echo(
+            f"A draft mapping to edit; --map FILE writes it to a file:\n\n{draft.text}"
+        )
         return
     for line in draft.unused:
         typer.echo(line)
     typer.echo(
-        f"a first mapping is in {mapping}: edit it, then nics import or nics generate"
+        f"a draft mapping is in {mapping}: edit it, then run nics import or nics generate"
     )
 
 
 def import_(
-    source: Annotated[Path, Argument(help="A bag, a table, or a folder of tables.")],
+    source: SourceArgument,
     mapping: Annotated[Path, Option("--map", help="YAML mapping, docs/recordings.md.")],
     out: Annotated[Path, Option(help="The .npz file to write.")],
     as_json: console.JsonOption = False,

@@ -10,6 +10,7 @@ from typer import Argument, Option
 from nics_drl_bridge.commands.console import (
     POLICIES,
     JsonOption,
+    PolicyFileArgument,
     make_robot_option,
     print_line,
 )
@@ -45,12 +46,7 @@ def info(
 
 @policy.command()
 def export(
-    file: Annotated[
-        str,
-        Argument(
-            autocompletion=POLICIES, help="A policy file, or the name of a shipped one."
-        ),
-    ],
+    file: PolicyFileArgument,
     leapp: Annotated[
         Path, Option(help="Folder of the bundle: network, YAML file, start values.")
     ],

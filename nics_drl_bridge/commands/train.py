@@ -96,7 +96,7 @@ def train(
             f"--{option}: a resumed run has its own settings; leave it out."
         )
     if resume and out is None:
-        raise ConfigError("--resume needs --out, the folder of the run to go on with.")
+        raise ConfigError("--resume requires --out, the folder of the run to continue.")
     if resume and out is not None and not (out / "settings.yaml").is_file():
         fix = "name the folder of a run with --out"
         raise ConfigError(f"{out}: contains no settings.yaml; {fix}.")
@@ -125,7 +125,9 @@ def train(
     command = shlex.join(["nics", *sys.argv[1:]])
     started = train_run.seeds_of(folder) if resume and not seeds else []
     if started:
-        typer.echo(f"seeds that were begun: {started}; --seeds names others", err=True)
+        typer.echo(
+            f"continuing the seeds {started}; choose others with --seeds", err=True
+        )
     all_seeds = [*(seeds or started or [0]), *further_seeds]
     order = train_run.TrainOrder(chosen, all_seeds, folder, episodes, resume, command)
     resume_command = make_resume_command(
@@ -166,9 +168,9 @@ def report_interruption(
         yield
     except BaseException as error:
         if was_interrupted(error) or isinstance(error, SystemExit):
-            line = f"{out}: no checkpoint was written yet; start again."
+            line = f"{out}: no checkpoint has been written yet; start again."
             if seeds_of(out):
-                line = f"to go on from the last checkpoint: {command}"
+                line = f"to continue from the last checkpoint: {command}"
             typer.echo(line, err=True)
         raise
 
@@ -178,7 +180,7 @@ def seeds_of_words(words: Sequence[str], after_seeds: bool) -> list[int]:
     for word in words:
         if not after_seeds or not word.isdecimal():
             fix = f"a task is given as --task {word}, seeds as --seeds 0 1 2"
-            raise ConfigError(f"nics train: what {word!r} means is not said; {fix}.")
+            raise ConfigError(f"nics train: unexpected argument {word!r}; {fix}.")
     return [int(word) for word in words]
 
 

@@ -50,9 +50,7 @@ def up(
 ) -> None:
     """Starts the nodes of a simulation, vehicle or fleet."""
     if what not in LAUNCHES:
-        raise ConfigError(
-            f"there is nothing called {what!r} to start; {suggest(what, LAUNCHES)}"
-        )
+        raise ConfigError(f"nics up can't start {what!r}; {suggest(what, LAUNCHES)}")
     launch = LAUNCHES[what]()
     if show_args:
         typer.echo(format_arguments(launch))
@@ -97,9 +95,7 @@ def run(nodes: Sequence[NodeStart]) -> None:
     processes: list[ChildProcess] = []
     with TemporaryDirectory(prefix="nics_up_") as folder, end_nodes_by_signals():
         commands = [make_command(node, Path(folder)) for node in nodes]
-        typer.echo(
-            f"starting {', '.join(map(name_of, nodes))}; Ctrl-C ends all of them"
-        )
+        typer.echo(f"starting {', '.join(map(name_of, nodes))}; Ctrl-C ends them all")
         next_step = describe_next_step(nodes)
         if next_step:
             typer.echo(next_step)
@@ -110,7 +106,7 @@ def run(nodes: Sequence[NodeStart]) -> None:
         finally:
             end_all(processes)
     typer.echo(
-        f"nics: {name} ended with code {code}, so everything was ended.", err=True
+        f"nics: {name} ended with code {code}, so all nodes were ended.", err=True
     )
     raise typer.Exit(EXIT_BAD_INPUT if code == EXIT_BAD_INPUT else EXIT_NODE_ENDED)
 

@@ -3,7 +3,7 @@
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing import get_context
 from typing import Annotated, Any
 
@@ -17,7 +17,7 @@ AllOption = Annotated[
     bool,
     typer.Option(
         "--all",
-        help="Also those of the planners, the gate and the estimator, as for a robot.",
+        help="Compile those of the planners, the gate and the estimator too, as a robot needs.",
     ),
 ]
 WheelOption = Annotated[
@@ -40,16 +40,8 @@ def warmup(
         os.environ |= {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""}
     typer.echo("compiling the kernels: a minute or two, once on this machine", err=True)
     parts = [_simulate, _drive] if all_kernels or for_wheel else [_simulate]
-    # Spawned, not forked: a fork could inherit a lock that is never released.
-    with (
-        show_progress("compiling"),
-        get_context("spawn").Pool(len(parts), _begin, (for_wheel,)) as pool,
-    ):
-        *first, model = pool.apply(_compile_by, (_model,))
-        jobs = [pool.apply_async(_compile_by, (part, model)) for part in parts]
-        done = [first, *(job.get()[:2] for job in jobs)]
-    count = sum(result[0] for result in done)
-    cpu_s = sum(result[1] for result in done)
+    with show_progress("compiling"):
+        count, cpu_s = _compile(parts, for_wheel)
     took = time.monotonic() - begin
     if as_json:
         typer.echo(format_json({"kernels": count, "cpu_s": cpu_s, "seconds": took}))
@@ -57,6 +49,16 @@ def warmup(
         typer.echo(
             f"compiled {count} kernels in {took:.0f} s ({cpu_s:.0f} s of CPU)", err=True
         )
+
+
+def _compile(parts: Sequence[Callable[..., Any]], for_wheel: bool) -> tuple[int, float]:
+    """Compiles parts at once; returns the number of kernels, and their CPU time [s]."""
+    # Spawned, not forked: a fork could inherit a lock that is never released.
+    with get_context("spawn").Pool(len(parts), _begin, (for_wheel,)) as pool:
+        *first, model = pool.apply(_compile_by, (_model,))
+        jobs = [pool.apply_async(_compile_by, (part, model)) for part in parts]
+        counts, cpu_s = zip(first, *(job.get()[:2] for job in jobs), strict=True)
+    return sum(counts), sum(cpu_s)
 
 
 def _begin(for_wheel: bool) -> None:

@@ -34,9 +34,7 @@ def watch(
             "times: side by side.",
         ),
     ] = None,
-    seed: Annotated[
-        int, Option(min=0, help="Seed of the first episode.")
-    ] = defaults.EVALUATION_SEED,
+    seed: console.FirstSeedOption = defaults.EVALUATION_SEED,
     lidar: console.OtherLidarOption = None,
     randomisation: console.RandomisationOption = None,
     gate: console.GateOption = None,
@@ -135,7 +133,9 @@ def _make_only_world(worlds: list[str] | None) -> Any:
     if worlds is None:
         return None
     if len(worlds) > 1:
-        raise ConfigError(f"--world {' '.join(worlds)}: a robot is in one; name that.")
+        raise ConfigError(
+            f"--world {' '.join(worlds)}: a robot is in one world; give only that one."
+        )
     from nics_drl_bridge.sim.world_set import load_worlds
 
     return load_worlds(worlds[0])

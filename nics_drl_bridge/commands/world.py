@@ -49,7 +49,7 @@ Shown = Annotated[
     str,
     Argument(
         metavar="WORLD",
-        help="A shipped one, a YAML file, or a set.",
+        help="A shipped world, a YAML file, or a set of worlds.",
         autocompletion=console.WORLDS,
     ),
 ]
@@ -94,7 +94,7 @@ def import_(
     goal_distance: Annotated[
         tuple[float, float] | None,
         Option(
-            metavar="LEAST GREATEST",
+            metavar="MIN MAX",
             help="From start to goal [m]; else from "
             f"{defaults.IMPORT_GOAL_DISTANCE_M:g} m on.",
         ),
@@ -184,7 +184,7 @@ def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path,
     twice = {str(place) for place in places if places.count(place) > 1}
     if twice:
         raise ConfigError(
-            f"{min(twice)}: two files would be written there; import them one by one."
+            f"{min(twice)}: two worlds would be written to it; import them one by one."
         )
     return dict(zip(files, places, strict=True))
 
@@ -295,7 +295,7 @@ def draw(
     out: Annotated[
         Path | None, Option(help="File to write; by default <world>_drawn.png.")
     ] = None,
-    seed: Annotated[int, Option(min=0, help="Seed of the episode.")] = 0,
+    seed: console.SeedOption = 0,
     robot: console.RobotOption = DEFAULT_ROBOT,
     footprint: Annotated[
         float | None, Option(help="Radius of a round robot instead [m].")
@@ -354,7 +354,7 @@ def map_(
     out: Annotated[
         Path | None, Option(help="File to write; by default <world>_map.yaml.")
     ] = None,
-    seed: Annotated[int, Option(min=0, help="Seed of the episode.")] = 0,
+    seed: console.SeedOption = 0,
     robot: console.RobotOption = DEFAULT_ROBOT,
     resolution: Annotated[float, Option(help="Maximum side of a cell [m].")] = 0.01,
     as_json: console.JsonOption = False,
@@ -376,13 +376,13 @@ def map_(
     worlds = load_worlds(name)
     sampler = SceneSampler(worlds, load_robot(robot).footprint_radius)
     scenes = sampler.draw([seed])
-    scene = scenes[0]
     member = int(scenes.member[0])
     opened = worlds.members[member]
     file = out or Path(Path(f"{opened.name}_map.yaml").name)
     check_suffix("--out", file, *MAPS)
     _check_overwrite(worlds, Path(name), file, file.with_suffix(".pgm"))
-    grid = occupancy(opened, standing(sampler, member, scene.bodies), resolution)
+    bodies = standing(sampler, member, scenes[0].bodies)
+    grid = occupancy(opened, bodies, resolution)
     map_files(grid, file)
     rows, columns = grid.cells.shape
     size = f"{columns} x {rows} cells of {grid.resolution:.4g} m"

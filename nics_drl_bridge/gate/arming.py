@@ -3,11 +3,18 @@
 A request to arm is granted if all `CHECKS` pass; the answer names those that fail.
 """
 
+import math
 from collections.abc import Callable
 
 from nics_drl_bridge.gate import estimate as estimates
 from nics_drl_bridge.gate import evidence, frozen, inputs, stops
 from nics_drl_bridge.gate import ground as grounds
+from nics_drl_bridge.gate.arrivals import (
+    AHEAD_S,
+    measure_creep,
+    measure_rate,
+    reset_envelope,
+)
 from nics_drl_bridge.gate.state import (
     Arrivals,
     GateConfig,
@@ -15,7 +22,6 @@ from nics_drl_bridge.gate.state import (
     ScanMotion,
     replace,
 )
-from nics_drl_bridge.gate.stops import reset_envelope
 from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 
@@ -34,7 +40,7 @@ def arm(
 ) -> tuple[GateState, str, bool]:
     """Arms the gate if all checks pass; returns the state, the answer, and if it was granted."""
     faults = []
-    for name, check in CHECKS:
+    for name, check in CHECKS.items():
         fault = check(config, state, request, now)
         if fault:
             faults.append(f"{name}: {fault}")
@@ -89,25 +95,10 @@ def _check_sensors(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
     for name, sensor in zip(config.sensors, state.sensors, strict=True):
-        fault = _judge_freshness(name, sensor.arrivals, config.scan_age_s, config, now)
+        fault = _judge_freshness(config, name, sensor.arrivals, config.scan_age_s, now)
         if fault:
             return fault
     return ""
-
-
-def _check_odometry_rate(
-    config: GateConfig, state: GateState, request: inputs.Arm, now: float
-) -> str:
-    """Odometry arrives at its declared rate, or by default at least as often as needed."""
-    arrivals = state.odometries
-    if config.odom_rate_declared:
-        return _judge_rate(ODOM, arrivals, config.odom_rate, config, now)
-    arriving, stamped = stops.measure_rate(arrivals, now, config.settle_s)
-    if min(arriving, stamped) >= config.odom_rate * (1.0 - config.rate_tolerance):
-        return ""
-    rates = f"{arriving:.1f} Hz, by its stamps {stamped:.1f} Hz"
-    needed = f"one per control period is needed, {config.odom_rate:.1f} Hz"
-    return f"odom comes at {rates}, {needed}, unless the parameter 'odom_rate' declares less"
 
 
 def _check_clocks(
@@ -125,9 +116,9 @@ def _check_clocks(
     if abs(lead) > config.clock_jump_s:
         return f"the stamps of scan are {lead:.3f} s ahead of those of odom"
     for topic, arrivals in ((SCAN, scans), (ODOM, odometries)):
-        ahead = stops.measure_creep(arrivals)
+        ahead = measure_creep(arrivals)
         behind = 0.0 if config.simulated else -ahead
-        if ahead > stops.AHEAD_S or behind > BEHIND_S:
+        if ahead > AHEAD_S or behind > BEHIND_S:
             away = f"run away from this machine's clock, by {ahead:+.3f} s in a moment"
             advice = (
                 "a simulation that is not in real time needs the parameter 'clock_rate'"
@@ -153,20 +144,6 @@ def _check_estimator(
     return f"{inputs.ESTIMATE} shows motion"
 
 
-def _check_publishers(
-    config: GateConfig, state: GateState, request: inputs.Arm, now: float
-) -> str:
-    if request.publishers == 1:
-        return ""
-    return f"cmd_vel has {request.publishers} publishers, not this gate alone"
-
-
-def _check_policies(
-    config: GateConfig, state: GateState, request: inputs.Arm, now: float
-) -> str:
-    return state.last_mixed if now - state.mixed_s < config.settle_s else ""
-
-
 def _check_standing(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
@@ -178,66 +155,57 @@ def _check_standing(
 def _check_e_stop(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
-    cause = stops.e_stop_pressed(config, state, now) or stops.e_stop_silent(
-        config, state, now
-    )
-    if cause is None:
-        return ""
-    if cause.rule == "e_stop_silent" and state.e_stop.heard_s is None:
-        return NEVER_HEARD
-    return cause.line
+    for rule in stops.STOPS:
+        cause = rule.judge(config, state, now) if rule.topic == inputs.E_STOP else None
+        if cause is not None:
+            is_known = state.e_stop.latched or state.e_stop.heard_s is not None
+            return cause.line if is_known else NEVER_HEARD
+    return ""
 
 
-def _check_limits(
-    config: GateConfig, state: GateState, request: inputs.Arm, now: float
-) -> str:
-    return UNLIMITED if config.limits is None else ""
-
-
-def _check_latch(
-    config: GateConfig, state: GateState, request: inputs.Arm, now: float
-) -> str:
-    return "" if state.latched is None else f"call ~/reset first: {state.latched.line}"
-
-
-def _check_scan_freshness(
-    config: GateConfig, state: GateState, request: inputs.Arm, now: float
-) -> str:
-    return _judge_freshness(SCAN, state.scans, config.scan_age_s, config, now)
-
-
-def _check_scan_rate(
-    config: GateConfig, state: GateState, request: inputs.Arm, now: float
-) -> str:
-    return _judge_rate(SCAN, state.scans, config.scan_rate, config, now)
-
-
-def _check_odometry_freshness(
-    config: GateConfig, state: GateState, request: inputs.Arm, now: float
-) -> str:
-    return _judge_freshness(ODOM, state.odometries, config.odom_age_s, config, now)
-
-
-CHECKS: tuple[tuple[str, Check], ...] = (
-    ("limits_set", _check_limits),
-    ("nothing_latched", _check_latch),
-    ("e_stop_released", _check_e_stop),
-    ("scan_fresh", _check_scan_freshness),
-    ("scan_rate", _check_scan_rate),
-    ("sensors_fresh", _check_sensors),
-    ("odom_fresh", _check_odometry_freshness),
-    ("odom_rate", _check_odometry_rate),
-    ("clocks_agree", _check_clocks),
-    ("estimator_converged", _check_estimator),
-    ("one_publisher", _check_publishers),
-    ("standing_still", _check_standing),
-    ("one_policy", _check_policies),
-)
+CHECKS: dict[str, Check] = {
+    "limits_set": lambda config, state, request, now: (
+        UNLIMITED if config.limits is None else ""
+    ),
+    "nothing_latched": lambda config, state, request, now: (
+        "" if state.latched is None else f"call ~/reset first: {state.latched.line}"
+    ),
+    "e_stop_released": _check_e_stop,
+    "scan_fresh": lambda config, state, request, now: _judge_freshness(
+        config, SCAN, state.scans, config.scan_age_s, now
+    ),
+    "scan_rate": lambda config, state, request, now: _judge_rate(
+        config, SCAN, state.scans, config.scan_rate, now
+    ),
+    "sensors_fresh": _check_sensors,
+    "odom_fresh": lambda config, state, request, now: _judge_freshness(
+        config, ODOM, state.odometries, config.odom_age_s, now
+    ),
+    "odom_rate": lambda config, state, request, now: _judge_rate(
+        config,
+        ODOM,
+        state.odometries,
+        config.odom_rate,
+        now,
+        config.odom_rate_declared,
+    ),
+    "clocks_agree": _check_clocks,
+    "estimator_converged": _check_estimator,
+    "one_publisher": lambda config, state, request, now: (
+        ""
+        if request.publishers == 1
+        else f"cmd_vel has {request.publishers} publishers, not this gate alone"
+    ),
+    "standing_still": _check_standing,
+    "one_policy": lambda config, state, request, now: (
+        state.last_mixed if now - state.mixed_s < config.settle_s else ""
+    ),
+}
 """Checks before the gate is armed, by name."""
 
 
 def _judge_freshness(
-    topic: str, arrivals: Arrivals, limit_s: float, config: GateConfig, now: float
+    config: GateConfig, topic: str, arrivals: Arrivals, limit_s: float, now: float
 ) -> str:
     """Data must have arrived without a gap for the settling time."""
     unbroken = now - arrivals.unbroken_s >= config.settle_s
@@ -247,13 +215,25 @@ def _judge_freshness(
 
 
 def _judge_rate(
-    topic: str, arrivals: Arrivals, declared: float, config: GateConfig, now: float
+    config: GateConfig,
+    topic: str,
+    arrivals: Arrivals,
+    rate: float,
+    now: float,
+    is_declared: bool = True,
 ) -> str:
-    """Judges a rate: by stamps it may be too low or too high, by arrival only too low."""
-    arriving, stamped = stops.measure_rate(arrivals, now, config.settle_s)
-    low = declared * (1.0 - config.rate_tolerance)
-    high = declared * (1.0 + config.rate_tolerance)
+    """Judges a rate: by arrival it may only be too low.
+
+    By stamps it may be too high as well, unless it is the minimum that is needed.
+    """
+    arriving, stamped = measure_rate(arrivals, now, config.settle_s)
+    low = rate * (1.0 - config.rate_tolerance)
+    high = rate * (1.0 + config.rate_tolerance) if is_declared else math.inf
     if arriving >= low and low <= stamped <= high:
         return ""
-    rates = f"{arriving:.1f} Hz, by its stamps {stamped:.1f} Hz"
-    return f"{topic} comes at {rates}, declared are {declared:.1f} Hz"
+    needed = f"declared are {rate:.1f} Hz"
+    if not is_declared:
+        fix = "unless the parameter 'odom_rate' declares less"
+        needed = f"one per control period is needed, {rate:.1f} Hz, {fix}"
+    measured = f"{arriving:.1f} Hz, by its stamps {stamped:.1f} Hz"
+    return f"{topic} comes at {measured}, {needed}"

@@ -92,30 +92,31 @@ class Replay(NamedTuple):
         return [*lines, f"{spent}: {verdict}"]
 
 
+class _Step(NamedTuple):
+    """One line of a file."""
+
+    now: float
+    event: Input
+    decision: Decision
+    plain: Any  # the decision as it is in the file
+
+
 def replay(path: str | Path) -> Replay:
     """Repeats all decisions in a file. Raises ConfigError if it is not a complete black box."""
     head, *lines = _read_records(path)
     try:
-        config = from_plain(head["config"])
-        state = from_plain(head["state"])
-        events = [
-            (line["now"], from_plain(line["given"]), line["decision"]) for line in lines
-        ]
-        recorded = [from_plain(decision) for *_, decision in events]
-        _check_kinds(config, state, events, recorded)
+        config, state, steps = _read_content(head, lines)
     except (KeyError, RecursionError, TypeError, ValueError) as error:
         raise _explain_damage(path, error) from None
     entries = []
     differing = []
-    for index, ((now, event, plain), decision) in enumerate(
-        zip(events, recorded, strict=True)
-    ):
-        entries.append(Entry(now, event, state, decision))
+    for index, step in enumerate(steps):
+        entries.append(Entry(step.now, step.event, state, step.decision))
         try:
-            state, replayed = decide(config, state, event, now)
+            state, replayed = decide(config, state, step.event, step.now)
         except Exception as error:  # noqa: BLE001 - false records break the rules in any way
             raise _explain_damage(path, error) from None
-        if json.dumps(to_plain(replayed)) != json.dumps(plain):
+        if json.dumps(to_plain(replayed)) != json.dumps(step.plain):
             differing.append(index)
     return Replay(tuple(entries), tuple(differing))
 
@@ -126,27 +127,33 @@ def _explain_damage(path: str | Path, error: Exception) -> ConfigError:
     )
 
 
-def _check_kinds(
-    config: Any, state: Any, events: list[Any], recorded: list[Any]
-) -> None:
+def _read_content(
+    head: dict[str, Any], lines: list[dict[str, Any]]
+) -> tuple[GateConfig, GateState, list[_Step]]:
     """Raises TypeError or ValueError for content that does not belong in a black box."""
-    if len(events) > MOST_INPUTS:
+    if len(lines) > MOST_INPUTS:
         raise ValueError(
-            f"{len(events)} inputs, where at most {MOST_INPUTS} are replayed"
+            f"{len(lines)} inputs, where at most {MOST_INPUTS} are replayed"
         )
-    kinds = (
-        (config, GateConfig),
-        (state, GateState),
-        *((decision, Decision) for decision in recorded),
-    )
-    for value, kind in kinds:
-        if not isinstance(value, kind):
-            raise TypeError(f"a {type(value).__name__} stands for a {kind.__name__}")
-    for now, event, _ in events:
+    config = _read_kind(head["config"], GateConfig)
+    state = _read_kind(head["state"], GateState)
+    steps = []
+    for line in lines:
+        now = line["now"]
         if not (isinstance(now, float | int) and abs(now) < LATEST_S):
             raise ValueError("the time of an input is no time")
-        if not isinstance(event, get_args(Input)):
-            raise TypeError(f"a {type(event).__name__} is no input")
+        event = _read_kind(line["given"], *get_args(Input))
+        plain = line["decision"]
+        steps.append(_Step(now, event, _read_kind(plain, Decision), plain))
+    return config, state, steps
+
+
+def _read_kind(plain: Any, *kinds: type) -> Any:
+    value = from_plain(plain)
+    if not isinstance(value, kinds):
+        names = " or ".join(kind.__name__ for kind in kinds)
+        raise TypeError(f"a {type(value).__name__} stands for a {names}")
+    return value
 
 
 def _read_records(path: str | Path) -> list[dict[str, Any]]:

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nics_drl_bridge.gate.frozen import measure_motion
 from nics_drl_bridge.gate.inputs import ESTIMATE, Estimate
 from nics_drl_bridge.gate.limits import get_maximum_speeds
 from nics_drl_bridge.gate.state import (
-    Cause,
     EstimateMark,
     EstimateTrack,
     GateConfig,
@@ -70,17 +70,15 @@ def _find_jump(
     config: GateConfig, before: Estimate, after: Estimate, passed_s: float
 ) -> str:
     """Returns the fault of a pose that the robot can't have reached, or ""."""
-    x, y, turn = between(before.pose, after.pose).tolist()
-    path = math.hypot(x, y)
-    speed = math.inf
-    turn_rate = math.inf
+    moved = measure_motion(between(before.pose, after.pose))
+    fastest = np.full(2, np.inf)
     if config.limits is not None:
-        speed, turn_rate = get_maximum_speeds(config.limits)
-    max_path = config.estimate_position + SLIP * speed * passed_s
-    max_turn = config.estimate_heading + SLIP * turn_rate * passed_s
-    if path <= max_path and abs(turn) <= max_turn:
+        fastest = np.array(get_maximum_speeds(config.limits))
+    allowed = np.array([config.estimate_position, config.estimate_heading])
+    if (moved <= allowed + SLIP * fastest * passed_s).all():
         return ""
-    return f"it jumped by {path:.3g} m and {abs(turn):.3g} rad in {passed_s:.2f} s"
+    path, turn = moved
+    return f"it jumped by {path:.3g} m and {turn:.3g} rad in {passed_s:.2f} s"
 
 
 def _explain_uncertainty(
@@ -118,11 +116,3 @@ def explain_unsteadiness(config: GateConfig, state: GateState, now: float) -> st
     return (
         f"{ESTIMATE}: {track.last_fault}; wait for {config.settle_s:g} s, or {REMEDY}"
     )
-
-
-def estimate_lost(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The estimate jumped or quickly became uncertain: its localiser is lost."""
-    fault = state.estimates.fault
-    if not fault or not config.estimate_required:
-        return None
-    return Cause("estimate_lost", ESTIMATE, f"{fault}; {REMEDY}")

@@ -6,8 +6,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.gate.scan_motion import SETTINGS, make_directions
+from nics_drl_bridge.gate.scan_motion_kernels import predict_scan
 from nics_drl_bridge.gate.state import (
-    Cause,
     GateConfig,
     GateState,
     Push,
@@ -15,26 +16,20 @@ from nics_drl_bridge.gate.state import (
     Sameness,
     replace,
 )
-from nics_drl_bridge.gate.stops import make_cause
 from nics_drl_bridge.geometry import between, compose
 from nics_drl_bridge.interface import Array
-from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 
 Flags = NDArray[np.bool_]
 IDENTICAL = 3  # minimum number of identical scans that count as frozen
 PICTURES = 16  # number of remembered scans; a lidar may cycle through several
-RESPONSE = (
-    0.1  # minimum fraction of the commanded distance or angle that a robot covers
-)
+RESPONSE = 0.1  # minimum fraction of the commanded path or turn that a robot covers
 # minimum motion commanded within the window for the robot to be judged [m], [rad]
-MIN_PATH = 0.03
-MIN_TURN = 0.25
+MIN_COMMANDED = np.array([0.03, 0.25])
 WINDOW = 0.75  # window as a fraction of `stuck_s`; the rest allows for odometry's delay
 MARK_S = 0.05  # between two marks
 PAUSE_S = 0.2  # minimum time without motion between pushes [s]
 # A robot slower than this, plus the noise of its odometry, stands still [m/s], [rad/s].
-REST_SPEED = 0.05
-REST_TURN_RATE = 0.1
+REST = np.array([0.05, 0.1])
 NOISE = 3.0  # tolerated noise of odometry, in standard deviations
 
 
@@ -57,8 +52,8 @@ def watch_pictures(
     if pose is None or first is None or picture.count < IDENTICAL:
         return (*others, picture), ""
     moved = between(first, pose)
-    path = max(float(np.hypot(moved[0], moved[1])), abs(float(moved[2])))
-    if path <= config.frozen_distance:
+    path = measure_motion(moved).max()
+    if path <= config.frozen_distance or len(ranges) < MIN_CHANGED_BEAMS:
         return (*others, picture), ""
     must_change = must_differ(config, picture.ranges, moved)
     unchanged = (picture.ranges == ranges) & must_change
@@ -74,9 +69,8 @@ def watch_pictures(
 
 def is_at_rest(config: GateConfig, twist: Array) -> bool:
     """True if a body twist (3,) is that of a robot at rest, within the noise of odometry."""
-    linear, turn = (NOISE * std for std in config.odom_std)
-    slow = np.hypot(twist[0], twist[1]) < REST_SPEED + linear
-    return bool(slow and abs(twist[2]) < REST_TURN_RATE + turn)
+    fastest = REST + NOISE * np.array(config.odom_std)
+    return bool((measure_motion(twist) < fastest).all())
 
 
 def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:
@@ -106,36 +100,28 @@ def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:
     return replace(state, push=push)
 
 
-def odom_jumped(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """Odometry reports a pose that the robot can't have reached."""
-    return make_cause("odom_jumped", ODOM, state.leap)
-
-
-def scan_frozen(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The same scan repeats although odometry shows motion."""
-    return make_cause("scan_frozen", SCAN, state.frozen)
-
-
-def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The robot is commanded to move but odometry shows none: stuck, unpowered, or frozen data."""
+def find_stuck(config: GateConfig, state: GateState, now: float) -> str:
+    """Returns the fault of a robot that does not follow its commands, or ""."""
     push = state.push
     if push is None or state.odometry is None or now - push.since_s <= config.stuck_s:
-        return None
+        return ""
     time, before, _ = push.marks[0]
-    commanded = push.commanded - before
-    path = float(np.hypot(commanded[0], commanded[1]))
-    turn = abs(float(commanded[2]))
-    if path < MIN_PATH and turn < MIN_TURN:
-        return None
+    commanded = measure_motion(push.commanded - before)
+    is_commanded = commanded >= MIN_COMMANDED
+    if not is_commanded.any():
+        return ""
     for _, _, pose in push.marks:  # moving back and forth also counts as motion
-        moved = between(pose, state.odometry.pose)
-        drove = path >= MIN_PATH and np.hypot(moved[0], moved[1]) >= RESPONSE * path
-        turned = turn >= MIN_TURN and abs(moved[2]) >= RESPONSE * turn
-        if drove or turned:
-            return None
+        moved = measure_motion(between(pose, state.odometry.pose))
+        if (is_commanded & (moved >= RESPONSE * commanded)).any():
+            return ""
+    path, turn = commanded
     request = f"{path:.2f} m and {turn:.2f} rad were commanded"
-    detail = f"no motion in {now - time:.2f} s, but {request}"
-    return Cause("no_motion", ODOM, detail)
+    return f"no motion in {now - time:.2f} s, but {request}"
+
+
+def measure_motion(motion: Array) -> Array:
+    """Returns the path [m] and the turn [rad] (2,) of a motion (3,)."""
+    return np.array([np.hypot(motion[0], motion[1]), abs(motion[2])])
 
 
 # two scans with this fraction of equal beams are the same; one beam may always differ
@@ -145,8 +131,6 @@ FROZEN_FRACTION = 0.9
 CHANGE = 0.02  # minimum change of a beam that must have changed [m]
 # heading errors of odometry; a beam must have changed under all of them [rad]
 HEADING_ERRORS = (-0.03, 0.0, 0.03)
-# an old beam is compared with beams at most this many beam spacings away
-NEIGHBOURS = 1.5
 MIN_CHANGED_BEAMS = 3
 
 
@@ -167,49 +151,17 @@ def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> Flags:
     """Returns which beams (B,) of a scan must have changed their length after a motion (3,)."""
     mount = np.array(config.mount)
     moved = between(mount, compose(moved, mount))
-    is_open = np.isposinf(ranges)
-    is_known = np.isfinite(ranges) | is_open
     far = config.range_max or float(ranges[np.isfinite(ranges)].max())
-    length = np.where(is_open, far, ranges)[is_known].astype(np.float64)
-    angles = config.beam_angles[is_known]
-    ends = np.stack(
-        [length * np.cos(angles), length * np.sin(angles), 0.0 * length], axis=1
-    )
-    changed = np.isfinite(ranges)
+    ends = np.where(np.isposinf(ranges), far, ranges).astype(np.float32)
+    nearest_open = far - measure_motion(moved)[0]  # end of a beam that did not return
+    predicted = np.empty_like(ends)
+    directions = make_directions(config, len(ranges), half_window=0)
+    must_change = np.isfinite(ranges)
     for error in HEADING_ERRORS:
-        moved_ends = between(moved + np.array([0.0, 0.0, error]), ends)
-        changed &= _find_changed(
-            config.beam_angles, ranges, moved_ends, is_open[is_known]
-        )
-    return np.asarray(changed)
-
-
-def _find_changed(angles: Array, ranges: Ranges, ends: Array, is_open: Flags) -> Flags:
-    """Returns which beams (B,) differ from the moved ends (K, 2) of old ones.
-
-    Next to an old beam that was open, only shorter ranges count.
-    """
-    bearing = np.arctan2(ends[:, 1], ends[:, 0])
-    order = np.argsort(bearing)
-    order = np.concatenate(
-        [order[-1:], order, order[:1]]
-    )  # wrap around by one at both ends
-    bearing = bearing[order]
-    is_open = is_open[order]
-    turn = 2.0 * np.pi
-    length = np.hypot(ends[order, 0], ends[order, 1])
-    bearing[0] -= turn
-    bearing[-1] += turn
-    wrapped = np.mod(angles + np.pi, turn) - np.pi
-    above = np.clip(np.searchsorted(bearing, wrapped), 1, len(bearing) - 1)
-    below = above - 1
-    spacing = abs(angles[1] - angles[0]) if len(angles) > 1 else turn
-    low = np.minimum(length[below], length[above])
-    high = np.maximum(length[below], length[above])
-    nearest = np.where(
-        wrapped - bearing[below] < bearing[above] - wrapped, below, above
-    )
-    close = np.abs(wrapped - bearing[nearest]) <= NEIGHBOURS * spacing
-    nearer = (ranges < low - CHANGE) & close
-    farther = (ranges > high + CHANGE) & close & ~is_open[below] & ~is_open[above]
-    return np.asarray(nearer | farther)
+        turned = moved + np.array([0.0, 0.0, error])
+        predict_scan(ends, directions, turned, SETTINGS.gap, predicted)
+        # Both are False where the old scan does not show what comes (NaN).
+        nearer = ranges < predicted - CHANGE
+        farther = (ranges > predicted + CHANGE) & (predicted < nearest_open)
+        must_change &= nearer | farther
+    return must_change

@@ -6,7 +6,7 @@ decision), so that a replay is bit-identical. For each input it takes these step
 1. Take its time, and note whether the gate's own clock is at fault.
 2. Add it to the state, or refuse it; see `intake`.
 3. Arm or reset, if requested; see `arming`.
-4. Stop, if a row of `STOPS` finds a cause. A stop is an immediate zero, since limits of
+4. Stop, if a row of `stops.STOPS` finds a cause. A stop is an immediate zero, since limits of
    rate and jerk apply only to motion. It is published at the input that causes it, and
    at every tick while it lasts.
 5. Otherwise, at a tick of the gate's clock, publish the newest command after all `SHAPERS`.
@@ -14,21 +14,10 @@ decision), so that a replay is bit-identical. For each input it takes these step
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
-from nics_drl_bridge.gate import (
-    arming,
-    estimate,
-    frozen,
-    inputs,
-    intake,
-    limits,
-    scan_motion,
-    shield,
-    stops,
-)
+from nics_drl_bridge.gate import arming, frozen, inputs, intake, limits, shield, stops
 from nics_drl_bridge.gate.state import (
     Cause,
     Decision,
@@ -75,15 +64,17 @@ def _find_causes(
 ) -> tuple[Cause | None, Cause | None]:
     """Returns the first cause of a stop, after which it is named, and the first latching one."""
     first = None
+    if not state.e_stop.latched:
+        first = state.latched  # an earlier stop, which waits for a reset
     # Latching rules are checked even after another cause, because their fault may last
     # for one input only.
-    for rule in STOPS:
+    for rule in stops.STOPS:
         if rule.needs_clock and state.clock_fault:
             continue
         cause = rule.judge(config, state, now)
-        if cause is not None and rule.latches:
-            return first or cause, cause
         first = first or cause
+        if cause is not None and rule.latches:
+            return first, cause
     return first, None
 
 
@@ -135,58 +126,6 @@ def _move(
         shielded=motion.shielded,
     )
     return frozen.watch_motion(config, state, now), None
-
-
-class Rule(NamedTuple):
-    """A reason to stop.
-
-    Attributes:
-        judge: function that returns the cause of a stop at a time [s], or None; the
-            rule has its name.
-        latches: the stop stays until a reset.
-        needs_clock: it latches by elapsed time, so it is not judged while the gate's clock is at
-            fault. Other rules may judge a wrong age: `own_clock` stops the robot anyway.
-    """
-
-    judge: Callable[[GateConfig, GateState, float], Cause | None]
-    latches: bool = False
-    needs_clock: bool = False
-
-
-def latched(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """An earlier stop waits for a reset."""
-    return state.latched
-
-
-def disarmed(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The gate has not been armed."""
-    remedy = "" if state.armed else "call ~/arm to let commands pass"
-    return stops.make_cause("disarmed", "", remedy)
-
-
-STOPS: tuple[Rule, ...] = (
-    Rule(stops.e_stop_pressed, latches=True),
-    Rule(latched),
-    Rule(disarmed),
-    Rule(stops.own_clock),
-    Rule(stops.e_stop_silent, latches=True, needs_clock=True),
-    Rule(stops.stamps_jumped, latches=True),
-    Rule(frozen.odom_jumped, latches=True),
-    Rule(frozen.scan_frozen, latches=True),
-    Rule(frozen.no_motion, latches=True, needs_clock=True),
-    Rule(scan_motion.body_held, latches=True),
-    Rule(estimate.estimate_lost, latches=True),
-    Rule(stops.two_policies, latches=True),
-    Rule(stops.scan_silent),
-    Rule(stops.sensor_silent),
-    Rule(stops.odom_silent),
-    Rule(stops.command_malformed),
-    Rule(stops.command_missing),
-    Rule(stops.command_silent),
-    Rule(stops.scan_behind_unknown),
-    Rule(stops.scan_behind_old),
-)
-"""The first rule that returns a cause names the stop; the first latching cause latches it."""
 
 
 def saturate(

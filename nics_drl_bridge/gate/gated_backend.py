@@ -7,13 +7,11 @@ import numpy as np
 from nics_drl_bridge import interface
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import inputs
-from nics_drl_bridge.gate.gate import decide
+from nics_drl_bridge.gate.gate_loop import Gate
 from nics_drl_bridge.gate.limits import load_limits
-from nics_drl_bridge.gate.state import Decision, GateConfig, begin, replace
+from nics_drl_bridge.gate.state import GateConfig, replace
 from nics_drl_bridge.gate.stopping import make_gate_config, shield_config
 from nics_drl_bridge.generator import SimulatorModel
-
-FIRST_NS = interface.NS_PER_S  # the clock at the beginning of an episode
 
 
 class GatedBackend:
@@ -32,14 +30,13 @@ class GatedBackend:
         shield, _ = shield_config(model, command_limits, limits)
         self._backend = backend
         self._model = model
-        self._period_ns = round(model.control_period * interface.NS_PER_S)
         self._config = make_gate_config(
             model,
             command_limits,
             shield,
             e_stop_required=False,
         )
-        if not self._period_ns * interface.S_PER_NS < GateConfig.gap_s:
+        if not model.control_period < GateConfig.gap_s:
             slow = f"commands come every {model.control_period:g} s, and it stops after"
             raise ConfigError(
                 f"the gate can't be simulated: {slow} {GateConfig.gap_s:g} s."
@@ -47,9 +44,9 @@ class GatedBackend:
 
     def reset(self, start: interface.Start) -> interface.RobotView:
         """Begins the episode of a seed; see `interface.Backend`."""
+        self._gate = Gate(self._config, self._model.lidar)
         # A person arms the gate beforehand; that time is not simulated.
-        self._state = replace(begin(self._config), armed=True)
-        self._now_ns = FIRST_NS
+        self._gate.state = replace(self._gate.state, armed=True)
         return self._pass_on(self._backend.reset(start))
 
     def step(
@@ -57,32 +54,22 @@ class GatedBackend:
     ) -> tuple[interface.RobotView, dict[str, Any]]:
         """Applies the gate's output for a command for one period; see `interface.Backend`."""
         robot = self._model.robot
-        self._give(inputs.Command(self._now_ns, robot.to_cmd_vel(command)))
-        decision = self._give(inputs.Tick())
+        self._gate.command(robot.to_cmd_vel(command))
+        decision = self._gate.tick()
         view, facts = self._backend.step(robot.from_cmd_vel(decision.twist))
-        self._now_ns += self._period_ns
+        self._gate.now += self._model.control_period
         cause = "" if decision.cause is None else decision.cause.rule
-        return self._pass_on(view), {
-            **facts,
-            "stopped_by": cause,
-            "shielded": decision.shielded,
-        }
+        gated = {"stopped_by": cause, "shielded": decision.shielded}
+        return self._pass_on(view), {**facts, **gated}
 
     def _pass_on(self, view: interface.RobotView) -> interface.RobotView:
-        lidar = self._model.lidar
-        now = self._now_ns
-        self._give(inputs.Odometry(now, view.pose.copy(), view.twist.copy()))
+        ranges = view.ranges.astype(np.float32, copy=False)
+        self._gate.sense(ranges, view.pose, view.twist)
         for sensor in self._model.sensors:
             points = sensor.points(view.sensed[sensor.name])
-            self._give(inputs.SensorReading(now, sensor.name, points))
-        angles = lidar.angle_min, lidar.angle_increment
-        self._give(inputs.Scan(now, view.ranges.astype(np.float32, copy=True), angles))
+            stamp_ns = self._gate.stamp_ns
+            self._gate.give(inputs.SensorReading(stamp_ns, sensor.name, points))
         return view
-
-    def _give(self, event: inputs.Input) -> Decision:
-        now = self._now_ns * interface.S_PER_NS
-        self._state, decision = decide(self._config, self._state, event, now)
-        return decision
 
     def facts(self) -> interface.BackendFacts:
         """Returns those of the backend behind the gate; see `interface.Backend`."""

@@ -17,6 +17,7 @@ import numpy as np
 from nics_drl_bridge.gate import estimate as estimates
 from nics_drl_bridge.gate import evidence, frozen, inputs, limits, scan_motion, stops
 from nics_drl_bridge.gate import ground as grounds
+from nics_drl_bridge.gate.arrivals import JUMPED, account_for_arrival
 from nics_drl_bridge.gate.state import (
     GateConfig,
     GateState,
@@ -34,14 +35,11 @@ Taken = tuple[GateState, str]
 MAX_SPEED = 100.0
 # maximum deviation of the last beam from its declared angle [rad]
 ANGLE_TOLERANCE = 1e-3
-# Downhill or when pushed, a robot may exceed its limits by this factor plus this [m/s],
-# [rad/s].
+# Downhill or when pushed, a robot may exceed its limits by this factor plus this [m/s], [rad/s].
 EXCESS_FACTOR = 2.0
-EXCESS_SPEED = 0.5
-EXCESS_TURN_RATE = 1.0
+EXCESS = np.array([0.5, 1.0])
 # jump of an odometry pose that may be due to imprecision [m], [rad]
-SMALL_JUMP = 0.1
-SMALL_JUMP_TURN = 0.2
+SMALL_JUMP = np.array([0.1, 0.2])
 
 
 def take(
@@ -124,7 +122,7 @@ def _take_command(
 def _take_scan(
     config: GateConfig, state: GateState, scan: inputs.Scan, now: float
 ) -> Taken:
-    arrivals, fault = stops.account_for_arrival(
+    arrivals, fault = account_for_arrival(
         config, state.scans, scan.stamp_ns, now, config.scan_age_s, state.armed
     )
     if fault:
@@ -152,7 +150,7 @@ def _take_scan(
 def _take_odometry(
     config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float
 ) -> Taken:
-    arrivals, fault = stops.account_for_arrival(
+    arrivals, fault = account_for_arrival(
         config, state.odometries, odometry.stamp_ns, now, config.odom_age_s, state.armed
     )
     if fault:
@@ -182,7 +180,7 @@ def _take_reading(
 ) -> Taken:
     index = config.sensors.index(reading.name)
     sensors = list(state.sensors)
-    arrivals, fault = stops.account_for_arrival(
+    arrivals, fault = account_for_arrival(
         config,
         sensors[index].arrivals,
         reading.stamp_ns,
@@ -198,7 +196,7 @@ def _take_reading(
 
 def _refuse_stamp(state: GateState, topic: str, fault: str) -> Taken:
     """Refuses data whose stamp repeated or jumped."""
-    if fault == stops.JUMPED:
+    if fault == JUMPED:
         state = replace(state, jumped=topic)
     return state, f"{topic}: its stamp {fault}"
 
@@ -213,19 +211,13 @@ def _find_leap(
         return ""
     stamped = (odometry.stamp_ns - before.stamp_ns) * S_PER_NS
     passed = max(stamped, now - state.odometries.times[-1])  # either time may jitter
-    path_noise, turn_noise = (frozen.NOISE * std * passed for std in config.odom_std)
-    speed, turn_rate = limits.get_maximum_speeds(bounds)
-    max_speed = EXCESS_FACTOR * speed + EXCESS_SPEED
-    max_turn_rate = EXCESS_FACTOR * turn_rate + EXCESS_TURN_RATE
-    max_path = SMALL_JUMP + max_speed * passed + path_noise
-    max_turn = SMALL_JUMP_TURN + max_turn_rate * passed + turn_noise
-    x, y, heading = between(before.pose, odometry.pose)
-    path = float(np.hypot(x, y))
-    if path <= max_path and abs(heading) <= max_turn:
+    noise = frozen.NOISE * np.array(config.odom_std)
+    fastest = EXCESS_FACTOR * np.array(limits.get_maximum_speeds(bounds)) + EXCESS
+    moved = frozen.measure_motion(between(before.pose, odometry.pose))
+    if (moved <= SMALL_JUMP + (fastest + noise) * passed).all():
         return ""
-    return (
-        f"its pose jumped by {path:.3g} m and {abs(heading):.3g} rad in {passed:.3f} s"
-    )
+    path, turn = moved
+    return f"its pose jumped by {path:.3g} m and {turn:.3g} rad in {passed:.3f} s"
 
 
 def scan_malformed(config: GateConfig, scan: inputs.Scan) -> str:

@@ -28,6 +28,7 @@ MIN_MOTION = 0.01
 # Within this time [s] a command must be able to reach this fraction of its maximum.
 LONGEST_START_S = 10.0
 STARTED = 0.01
+HARDEST = 1e4  # maximum deceleration of a robot [m/s^2]
 SPEED = "m/s"
 TURN = "rad/s"
 # maximum turn rate of a robot that is commanded by steering angle [rad/s]
@@ -53,13 +54,13 @@ class Stopping(Schema):
     """Stopping behaviour, for the shield: distance = v latency + v^2 / (2 deceleration)."""
 
     # time from a command until the robot follows it, including lags [s]
-    latency: float = Field(ge=0.0)
+    latency: float = Field(ge=0.0, le=10.0)
     # deceleration of the following braking [m/s^2]
-    deceleration: float = Field(gt=0.0)
+    deceleration: float = Field(ge=1e-3, le=HARDEST)
     # clearance kept around the footprint [m]
-    margin: float = Field(default=0.05, ge=0.0)
+    margin: float = Field(default=0.05, ge=0.0, le=10.0)
     # speed of approaching obstacles [m/s]; 0 if all are static
-    obstacle_speed: float = Field(default=1.0, ge=0.0)
+    obstacle_speed: float = Field(default=1.0, ge=0.0, le=100.0)
 
 
 class LimitsFile(Schema):

@@ -26,7 +26,6 @@ from nics_drl_bridge.gate import scan_motion_kernels as kernels
 from nics_drl_bridge.gate.inputs import Odometry, Scan
 from nics_drl_bridge.gate.scan_motion_kernels import Directions, Noise, Thresholds
 from nics_drl_bridge.gate.state import (
-    Cause,
     GateConfig,
     GateState,
     Ranges,
@@ -34,10 +33,8 @@ from nics_drl_bridge.gate.state import (
     ScanMotion,
     replace,
 )
-from nics_drl_bridge.gate.stops import make_cause
 from nics_drl_bridge.geometry import between, compose, exp
 from nics_drl_bridge.interface import S_PER_NS, Array
-from nics_drl_bridge.middleware.measurement import SCAN
 
 FULL_CIRCLE = 2.0 * np.pi
 BEAM_COUNT_TOLERANCE = 1e-6  # tolerance of a number of beams
@@ -175,11 +172,6 @@ def watch_scan(config: GateConfig, state: GateState, scan: Scan) -> ScanMotion:
         share=verdict.share,
         push_s=push_s,
     )
-
-
-def body_held(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The scans show none of the motion that odometry shows: the body is held, its wheels spin."""
-    return make_cause("body_held", SCAN, state.scan_motion.held)
 
 
 def extrapolate_pose(odometry: Odometry, stamp_ns: int, longest_s: float) -> Array:
@@ -337,18 +329,24 @@ def _reduce_scan(config: GateConfig, ranges: Ranges) -> Ranges:
 def get_directions(config: GateConfig) -> Directions:
     """Returns the directions of a lidar's reduced scans."""
     beams = len(config.beam_angles)
-    first = float(config.beam_angles[0])
     step = float(config.beam_angles[1] - config.beam_angles[0])
     size = min(beams, max(1, round(beams * step / SETTINGS.spacing)))
-    beams_per_direction = beams / size
     half_window = min(
         int(SETTINGS.window / step + BEAM_COUNT_TOLERANCE),
         (kernels.LARGEST_WINDOW - 1) // 2,
         (beams - 1) // 2,
     )
+    return make_directions(config, size, half_window)
+
+
+def make_directions(config: GateConfig, size: int, half_window: int) -> Directions:
+    """Returns a number of directions, evenly spaced over the beams of a lidar."""
+    beams = len(config.beam_angles)
+    step = float(config.beam_angles[1] - config.beam_angles[0])
+    beams_per_direction = beams / size
     return Directions(
         size=size,
-        first=first + int(0.5 * beams_per_direction) * step,
+        first=float(config.beam_angles[0]) + int(0.5 * beams_per_direction) * step,
         step=beams_per_direction * step,
         beams_per_direction=beams_per_direction,
         half_window=half_window,
@@ -370,7 +368,7 @@ def compute_noise(config: GateConfig, directions: Directions) -> Noise:
 
 def warm_up(config: GateConfig) -> None:
     """Compiles the kernels for a scan, which takes seconds that a moving robot does not have."""
-    if not _can_judge(config):
+    if len(config.beam_angles) < 2:
         return
     ranges = np.ones(len(config.beam_angles), np.float32)
     view = ReducedScan(0, np.zeros(3), _reduce_scan(config, ranges))

@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.gate import evidence_kernels, ground, shield_kernels
+from nics_drl_bridge.gate.arrivals import compute_age
 from nics_drl_bridge.gate.evidence import make_static
 from nics_drl_bridge.gate.evidence_kernels import MountedBeams, Tolerance
 from nics_drl_bridge.gate.footprint import get_body
@@ -37,7 +38,6 @@ from nics_drl_bridge.gate.state import (
     View,
     replace,
 )
-from nics_drl_bridge.gate.stops import compute_age
 from nics_drl_bridge.interface import Array
 
 TimedCommand = tuple[float, Array]  # time of its publication [s], and its values (C,)
@@ -65,14 +65,30 @@ class Stop(NamedTuple):
     deceleration: float  # [m/s^2]
 
 
+class Threat(NamedTuple):
+    """Obstacles before which the robot must be able to stop.
+
+    Attributes:
+        obstacles: (P, 3), see `evidence`.
+        stops: in which none of them may come too near.
+        commands: (C,) each, besides the new one, that the robot may follow.
+        odometry: (3,) twist that the robot may have; None if only the commands count.
+    """
+
+    obstacles: Array
+    stops: list[Stop]
+    commands: tuple[Array, ...] = ()
+    odometry: Array | None = None
+
+
 def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
     """Reduces a motion until the robot can stop before every obstacle.
 
     A motion from which the robot can stop passes as it is. Otherwise:
 
     - If the turn on the spot is safe, the turn rate is kept and only the speed is
-      reduced: an obstacle ahead must not prevent the robot from turning away. -
-      Otherwise, speed and turn rate are scaled by the same factor, which keeps the
+      reduced: an obstacle ahead must not prevent the robot from turning away.
+    - Otherwise, speed and turn rate are scaled by the same factor, which keeps the
       robot on its path. If only a creep remains, but the robot could stop from
       `CREEP_SPEED` straight ahead, the turn is removed instead: an obstacle at its side
       must not prevent the robot from leaving straight ahead.
@@ -93,8 +109,7 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     turns_on_the_spot = turns and limiter.wheelbase == 0.0
     if speed == 0.0 and not turns:
         return motion
-    sensor_points = [make_static(sensor.points) for sensor in state.sensors]
-    obstacles = np.concatenate([state.obstacles, *sensor_points])
+    threats = _list_threats(config, limiter, state, now)
 
     def scale_motion(speed_scale: float, turn_scale: float) -> Array:
         scales = np.where(
@@ -104,9 +119,7 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
 
     def can_stop(speed_scale: float, turn_scale: float) -> bool:
         value = scale_motion(speed_scale, turn_scale)
-        return _can_stop_calmly(
-            config, limiter, value, obstacles
-        ) and _can_stop_suddenly(config, limiter, state, value, obstacles, now)
+        return all(_is_free(config, limiter, threat, value) for threat in threats)
 
     is_creep = turns_on_the_spot and 0.0 < speed < CREEP_SPEED
     if can_stop(1.0, 1.0) and (not is_creep or can_stop(CREEP_SPEED / speed, 1.0)):
@@ -145,47 +158,44 @@ def _find_maximum_scale(can_stop: Callable[[float], bool]) -> float:
     return low
 
 
-def _can_stop_calmly(
-    config: GateConfig, shield: ShieldConfig, value: Array, obstacles: Array
-) -> bool:
-    """True if a robot with a command (C,) can stop before static obstacles after the next scan."""
-    twists = _span_twists(config, shield, value[None], None)
-    # The command takes effect after a latency. The next scan arrives after a period, and
-    # the stop is decided after `hold_s` and takes effect after another latency.
-    reaction_s = (
-        1.0 / config.scan_rate + (shield.hold_s + shield.latency_s) + shield.latency_s
+def _list_threats(
+    config: GateConfig, shield: ShieldConfig, state: GateState, now: float
+) -> tuple[Threat, Threat]:
+    """Returns the threats of a calm and of a sudden stop."""
+    sensor_points = [make_static(sensor.points) for sensor in state.sensors]
+    obstacles = np.concatenate([state.obstacles, *sensor_points])
+    # A stop is decided after `hold_s` and takes effect after a latency.
+    decided_s = shield.hold_s + shield.latency_s
+    # The new command takes effect after a latency; the next scan arrives after a period.
+    calm_s = 1.0 / config.scan_rate + decided_s + shield.latency_s
+    calm = Threat(
+        make_static(obstacles[:, :2]),
+        list_stops(shield, calm_s, CALM_BRAKING, latencies=2.0),
     )
-    stops = list_stops(shield, reaction_s, CALM_BRAKING, latencies=2.0)
-    return _is_free(make_static(obstacles[:, :2]), twists, stops)
-
-
-def _can_stop_suddenly(
-    config: GateConfig,
-    shield: ShieldConfig,
-    state: GateState,
-    value: Array,
-    obstacles: Array,
-    now: float,
-) -> bool:
-    """True if the robot can stop before moving obstacles, whatever its current motion."""
     arrivals = [state.scans, *(sensor.arrivals for sensor in state.sensors)]
     data_age_s = max(0.0, *(compute_age(topic, now) for topic in arrivals))
     # Commands in effect since the oldest data, or within a reaction time before.
     since_s = now - data_age_s - _get_longest_reaction(shield)
     unshown = [command for _, command in _select_in_force(state.recent, since_s, now)]
-    commands = np.array([*unshown, state.value, value])
-    odometry = np.zeros(3)
-    if state.odometry is not None:
-        odometry = state.odometry.twist
-    twists = _span_twists(config, shield, commands, odometry)
-    reaction_s = data_age_s + (shield.hold_s + shield.latency_s)
-    stops = list_stops(shield, reaction_s, 1.0, latencies=1.0)
-    return _is_free(obstacles, twists, stops)
+    sudden = Threat(
+        obstacles,
+        list_stops(shield, data_age_s + decided_s, 1.0, latencies=1.0),
+        (*unshown, state.value),
+        np.zeros(3) if state.odometry is None else state.odometry.twist,
+    )
+    return calm, sudden
 
 
-def _is_free(obstacles: Array, twists: Array, stops: list[Stop]) -> bool:
-    """True if no obstacle (P, 3) comes too near in any stop from any of the twists (K, 3)."""
-    return all(shield_kernels.is_free(obstacles, twists, *stop, STEP) for stop in stops)
+def _is_free(
+    config: GateConfig, shield: ShieldConfig, threat: Threat, value: Array
+) -> bool:
+    """True if no obstacle of a threat comes too near in any stop from a new command (C,)."""
+    commands = np.array([*threat.commands, value])
+    twists = _span_twists(config, shield, commands, threat.odometry)
+    return all(
+        shield_kernels.is_free(threat.obstacles, twists, *stop, STEP)
+        for stop in threat.stops
+    )
 
 
 def append_command(

@@ -8,9 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from nics_drl_bridge.config import find_config, load_yaml
+from nics_drl_bridge.config import find_config, load_yaml, validate
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.gate.limits import SPEED, TURN, Limits, LimitsFile, Stopping
+from nics_drl_bridge.gate.limits import (
+    HARDEST,
+    SPEED,
+    TURN,
+    Limits,
+    LimitsFile,
+    Stopping,
+)
 from nics_drl_bridge.gate.state import GateConfig, ShieldConfig
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.spec import LidarSpec
@@ -20,13 +27,6 @@ from nics_drl_bridge.robot.spec import RobotSpec
 ANGLE = "rad"
 UNKNOWN_LAG_S = 0.5  # lag of a robot whose model shows none [s]
 UNKNOWN_DECELERATION = 0.5  # deceleration of a robot whose limits are not known [m/s^2]
-SHIELD_SPANS = {  # beyond them the robot could never move
-    "latency": (0, 10),
-    "deceleration": (1e-3, 1e4),
-    "margin": (0, 10),
-    "obstacle_speed": (0, 100),
-}
-HARDEST = SHIELD_SPANS["deceleration"][1]
 MIN_SHIELD_BEAMS = 2  # minimum number of beams that show the width of an obstacle
 # minimum number of data within the settling time for a rate to be known
 MIN_DATA = 2
@@ -66,14 +66,6 @@ def _get_range_noise(lidar: LidarSpec) -> tuple[float, float]:
     return lidar.noise_std, lidar.faults.noise_proportional
 
 
-def _check_spans(values: Stopping) -> None:
-    for name, value in values.model_dump().items():
-        low, high = SHIELD_SPANS[name]
-        if not low <= value <= high:
-            needed = f"it must be from {low:g} to {high:g}"
-            raise ConfigError(f"parameter 'shield_{name}' is {value:g}; {needed}.")
-
-
 def shield_config(
     model: SimulatorModel,
     limits: Limits | None,
@@ -86,11 +78,10 @@ def shield_config(
     limits; `overrides` take precedence.
     """
     if model.lidar.beams < MIN_SHIELD_BEAMS:
-        fault = f"the shield needs a lidar of {MIN_SHIELD_BEAMS} beams or more"
-        advice = "use another one, or drive without a shield by `shield: false`"
         raise ConfigError(
-            f"robot {model.robot.name!r}: {fault}, and this one has "
-            f"{model.lidar.beams}; {advice}."
+            f"robot {model.robot.name!r}: the shield needs a lidar of {MIN_SHIELD_BEAMS} beams or "
+            f"more, and this one has {model.lidar.beams}; use another one, or drive without a "
+            "shield by `shield: false`."
         )
     path = find_config(file, "limits") if file else None
     measured = load_yaml(path, LimitsFile).shield if path else None
@@ -102,14 +93,11 @@ def shield_config(
             advice = "The file of limits may give it: `shield: {latency: .., deceleration: ..}`."
             raise ConfigError(f"{error} {advice}") from None
         braking = Braking(0.0, math.inf)
-    stopping = measured
-    if stopping is None:
-        stopping = Stopping(
-            latency=braking.reaction_s, deceleration=min(braking.deceleration, HARDEST)
-        )
-    values = stopping.model_copy(update=dict(overrides))
-    _check_spans(values)
-    lidar = model.lidar
+    deceleration = min(braking.deceleration, HARDEST)
+    stopping = {"latency": braking.reaction_s, "deceleration": deceleration}
+    if measured is not None:
+        stopping = measured.model_dump()
+    values = validate({**stopping, **overrides}, Stopping, "the shield's parameters")
     config = ShieldConfig(
         latency_s=values.latency,
         deceleration=values.deceleration,
@@ -118,8 +106,8 @@ def shield_config(
         footprint_radius=model.robot.footprint_radius,
         wheelbase=get_wheelbase(model.robot),
         obstacle_speed=values.obstacle_speed,
-        range_max=lidar.range_max,
-        range_noise=_get_range_noise(lidar),
+        range_max=model.lidar.range_max,
+        range_noise=_get_range_noise(model.lidar),
         outline=model.robot.footprint or (),
         lever=braking.lever_m,
         order=braking.order,

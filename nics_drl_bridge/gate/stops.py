@@ -1,191 +1,19 @@
-"""Rules that stop the robot by the age of data, the gate's own clock, commands and e-stop."""
-# Age is the time since arrival on the steady clock, plus delay. The envelope is the
-# maximum lead of stamps over that clock, i.e. the lead of the fastest data. Once the
-# gate is armed, the envelope changes no faster than real clocks drift, so that slowly
-# creeping stamps are not accepted as normal.
+"""Rules that stop the robot, and the gate's own clock and sources of commands that they judge."""
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
-from nics_drl_bridge.gate.inputs import E_STOP, RAW, Command, Input, Tick
-from nics_drl_bridge.gate.state import (
-    Arrivals,
-    Cause,
-    GateConfig,
-    GateState,
-    Mark,
-    replace,
-)
-from nics_drl_bridge.interface import S_PER_NS
+from nics_drl_bridge.gate import estimate, frozen
+from nics_drl_bridge.gate.arrivals import compute_age
+from nics_drl_bridge.gate.inputs import E_STOP, ESTIMATE, RAW, Command, Input, Tick
+from nics_drl_bridge.gate.state import Cause, GateConfig, GateState, replace
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 
-# faults of a stamp
-REPEATED = "repeated"
-JUMPED = "jumped"
-# number of remembered stamps; older scans are unknown
-KEPT_STAMPS = 64
-MARK_S = 0.05  # time between two marks [s]
-DRIFT = 1e-3  # maximum drift between two clocks [s/s]; real machines drift by 1e-4
-SIMULATED_LAG = 0.2  # fraction of real time that a simulator may lose
-# data that lead an armed gate's envelope by more than this are from the future [s]
-AHEAD_S = 0.1
 SOURCE_S = 1.0  # time after which a command of another publisher is accepted [s]
 # a running clock never gives this many consecutive inputs the same time
 FROZEN_INPUTS = 20
-
-
-def account_for_arrival(
-    config: GateConfig,
-    arrivals: Arrivals,
-    stamp_ns: int,
-    now: float,
-    gap_s: float,
-    armed: bool,
-) -> tuple[Arrivals, str]:
-    """Returns the arrivals with a new datum, and `repeated`, `jumped` or "".
-
-    After a jump only the new datum is kept.
-
-    Args:
-        config: of the gate.
-        arrivals: of the earlier data of this topic.
-        stamp_ns: of the new datum's header.
-        now: its arrival [s].
-        gap_s: time between two data that counts as a gap [s].
-        armed: the gate is armed, so the envelope may only drift.
-    """
-    fresh = Arrivals(
-        stamps_ns=(stamp_ns,),
-        times=(now,),
-        late=(0.0,),
-        origin=(stamp_ns, now),
-        count=1,
-        envelope=0.0,
-        unbroken_s=now,
-        marks=((now, stamp_ns, 1, 0.0),),
-    )
-    if not arrivals.times:
-        return fresh, ""
-    step = (stamp_ns - arrivals.stamps_ns[-1]) * S_PER_NS
-    if step < -config.clock_jump_s:
-        return fresh, JUMPED
-    if step <= 0.0:
-        return arrivals, REPEATED
-    first_ns, first_s = arrivals.origin
-    lead = (stamp_ns - first_ns) * S_PER_NS / config.clock_rate - (now - first_s)
-    if lead - arrivals.envelope > (AHEAD_S if armed else config.clock_jump_s):
-        return fresh, JUMPED
-    marks = _append_mark(arrivals, stamp_ns, now, lead, config.settle_s)
-    passed = now - arrivals.times[-1]
-    envelope = max(mark[3] for mark in marks)
-    if armed:
-        fall = SIMULATED_LAG if config.simulated else DRIFT
-        # A longer gap may be a pause of the gate itself, after which queued data are
-        # late.
-        lowest = arrivals.envelope - fall * min(passed, gap_s)
-        highest = arrivals.envelope + DRIFT * passed
-        envelope = min(max(lead, lowest), highest)
-    kept = slice(1 - KEPT_STAMPS, None)
-    continued = Arrivals(
-        stamps_ns=(*arrivals.stamps_ns[kept], stamp_ns),
-        times=(*arrivals.times[kept], now),
-        late=(*arrivals.late[kept], max(0.0, envelope - lead)),
-        origin=arrivals.origin,
-        count=arrivals.count + 1,
-        envelope=envelope,
-        unbroken_s=now if passed > gap_s else arrivals.unbroken_s,
-        marks=marks,
-    )
-    return continued, ""
-
-
-def _append_mark(
-    arrivals: Arrivals, stamp_ns: int, now: float, lead: float, settle_s: float
-) -> tuple[Mark, ...]:
-    *before, (time, stamp, number, greatest) = arrivals.marks
-    if now - time < MARK_S:
-        return (*before, (time, stamp, number, max(lead, greatest)))
-    kept = (mark for mark in arrivals.marks if mark[0] >= now - settle_s - 2.0 * MARK_S)
-    return (*kept, (now, stamp_ns, arrivals.count + 1, lead))
-
-
-def reset_envelope(arrivals: Arrivals) -> Arrivals:
-    """Returns the arrivals with an envelope computed only from the marks."""
-    leads = [mark[3] for mark in arrivals.marks]
-    return replace(arrivals, envelope=max(leads, default=arrivals.envelope))
-
-
-def compute_age(arrivals: Arrivals, now: float) -> float:
-    """Returns the age of the newest datum with its delay [s]; inf if there is none."""
-    if not arrivals.times:
-        return math.inf
-    return now - arrivals.times[-1] + arrivals.late[-1]
-
-
-def _judge_age(
-    rule: str, topic: str, detail: str, age: float, limit: float
-) -> Cause | None:
-    """Returns the cause of a stop if an age is beyond its limit [s], or NaN."""
-    return None if age <= limit else Cause(rule, topic, detail, age, limit)
-
-
-def make_cause(rule: str, topic: str, detail: str) -> Cause | None:
-    """Returns the cause of a stop; None if there is no detail."""
-    return Cause(rule, topic, detail) if detail else None
-
-
-def scan_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The newest scan is too old: the lidar has stopped."""
-    return _judge_age(
-        "scan_silent",
-        SCAN,
-        "no fresh data",
-        compute_age(state.scans, now),
-        config.scan_age_s,
-    )
-
-
-def sensor_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The newest reading of an additional sensor is too old: it has stopped."""
-    ages = [
-        (compute_age(sensor.arrivals, now), name)
-        for name, sensor in zip(config.sensors, state.sensors, strict=True)
-    ]
-    age, name = max(ages, default=(0.0, ""))
-    return _judge_age("sensor_silent", name, "no fresh data", age, config.scan_age_s)
-
-
-def odom_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The newest odometry is too old: it has stopped."""
-    age = compute_age(state.odometries, now)
-    return _judge_age("odom_silent", ODOM, "no fresh data", age, config.odom_age_s)
-
-
-def stamps_jumped(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """A sensor's clock has jumped or runs ahead: its stamps lie in the future, or far back."""
-    if not state.jumped:
-        return None
-    detail = "its stamps have jumped, or run ahead of time"
-    return Cause("stamps_jumped", state.jumped, detail)
-
-
-def measure_rate(
-    arrivals: Arrivals, now: float, settle_s: float
-) -> tuple[float, float]:
-    """Returns the rate by arrival and by stamps over the settling time [Hz]; 0 if unknown."""
-    first = next((mark for mark in arrivals.marks if mark[0] >= now - settle_s), None)
-    if first is None or arrivals.count <= first[2]:
-        return 0.0, 0.0
-    count = arrivals.count - first[2]
-    passed = arrivals.times[-1] - first[0]
-    stamped = (arrivals.stamps_ns[-1] - first[1]) * S_PER_NS
-    return (count / passed if passed > 0.0 else math.inf), count / stamped
-
-
-def measure_creep(arrivals: Arrivals) -> float:
-    """Returns the increase of the lead over the steady clock in the later half of the marks [s]."""
-    leads = [mark[3] for mark in arrivals.marks]
-    half = len(arrivals.marks) // 2
-    return max(leads[half:]) - max(leads[:half]) if half else 0.0
+NO_DATA = "no fresh data"
 
 
 def take_time(
@@ -219,11 +47,6 @@ def take_time(
     )
 
 
-def own_clock(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The gate's clock can't be trusted, or the gate was asleep."""
-    return make_cause("own_clock", "", state.clock_fault)
-
-
 def watch_source(state: GateState, command: Command, now: float) -> GateState:
     """Records the publisher of a command, and whether another one was recently active."""
     mixed = ""
@@ -240,69 +63,193 @@ def watch_source(state: GateState, command: Command, now: float) -> GateState:
     return replace(state, mixed=mixed, last_mixed=mixed, mixed_s=now)
 
 
-def two_policies(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """Two publishers command the robot alternately."""
-    return make_cause("two_policies", RAW, state.mixed)
+class Fault(NamedTuple):
+    """What a rule finds.
+
+    Attributes:
+        detail: in words; empty if there is no fault.
+        age_s: of data that may be too old.
+        limit_s: beyond which an age is a fault.
+        topic: of the cause, if it is not always that of the rule.
+    """
+
+    detail: str
+    age_s: float = math.nan
+    limit_s: float = math.nan
+    topic: str = ""
 
 
-def command_malformed(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The newest command is malformed."""
-    return make_cause("command_malformed", RAW, state.malformed)
+class Rule(NamedTuple):
+    """A reason to stop.
+
+    Attributes:
+        name: of the rule.
+        topic: of the cause; empty for the gate itself.
+        find: returns the fault at a time [s], if any.
+        latches: the stop stays until a reset.
+        needs_clock: it latches by elapsed time, so it is not judged while the gate's clock is at
+            fault. Other rules may judge a wrong age: `own_clock` stops the robot anyway.
+    """
+
+    name: str
+    topic: str
+    find: Callable[[GateConfig, GateState, float], Fault]
+    latches: bool = False
+    needs_clock: bool = False
+
+    def judge(self, config: GateConfig, state: GateState, now: float) -> Cause | None:
+        """Returns the cause of a stop at a time [s], or None."""
+        fault = self.find(config, state, now)
+        # `<=` is false for an age of NaN, which is a fault, too.
+        if not fault.detail or fault.age_s <= fault.limit_s:
+            return None
+        topic = fault.topic or self.topic
+        return Cause(self.name, topic, fault.detail, fault.age_s, fault.limit_s)
 
 
-def command_missing(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """No command has arrived yet."""
-    if state.command is not None or state.pending is not None:
-        return None
-    return Cause("command_missing", RAW, "no command yet")
+NO_FAULT = Fault("")
 
 
-def command_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The policy has stopped, or hangs."""
-    if state.command is None:
-        return None
-    age = now - state.command_s
-    return _judge_age(
-        "command_silent", RAW, "no fresh command", age, config.command_age_s
-    )
+def _find_press(config: GateConfig, state: GateState, now: float) -> Fault:
+    stop = state.e_stop
+    if not stop.latched:
+        return NO_FAULT
+    return Fault("pressed" if stop.held else stop.reason or "was pressed")
 
 
-def scan_behind_unknown(
-    config: GateConfig, state: GateState, now: float
-) -> Cause | None:
-    """Commands name scans that do not arrive, perhaps from the future. One may be in transit."""
-    if state.pending is None or state.pending_s is None:
-        return None
-    if now - state.pending_s <= config.race_s and state.command is not None:
-        return None
-    detail = f"the scan behind it ({state.pending.stamp_ns}) never arrived"
-    return Cause("scan_behind_unknown", RAW, detail)
-
-
-def scan_behind_old(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The scan behind the command is old, however fresh the command: a republisher, or a hang."""
-    if state.command is None:
-        return None
-    detail = f"the scan behind {RAW} is old"
-    age = now - state.behind_s
-    return _judge_age("scan_behind_old", SCAN, detail, age, config.scan_age_s)
-
-
-def e_stop_pressed(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The emergency stop was pressed."""
-    if not state.e_stop.latched:
-        return None
-    if state.e_stop.held:
-        return Cause("e_stop_pressed", E_STOP, "pressed")
-    return Cause("e_stop_pressed", E_STOP, state.e_stop.reason or "was pressed")
-
-
-def e_stop_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The emergency stop is silent: a cut cable? An optional one must have been heard before."""
-    age = math.inf
-    if state.e_stop.heard_s is not None:
-        age = now - state.e_stop.heard_s
-    elif not config.e_stop_required:
-        return None
+def _find_silent_e_stop(config: GateConfig, state: GateState, now: float) -> Fault:
+    heard_s = state.e_stop.heard_s
+    if heard_s is None and not config.e_stop_required:
+        return NO_FAULT  # an optional one must have been heard before
+    age_s = math.inf if heard_s is None else now - heard_s
     detail = "its heartbeat is silent, as if pressed"
-    return _judge_age("e_stop_silent", E_STOP, detail, age, config.e_stop_silence_s)
+    return Fault(detail, age_s, config.e_stop_silence_s)
+
+
+def _find_silent_sensor(config: GateConfig, state: GateState, now: float) -> Fault:
+    ages = [
+        (compute_age(sensor.arrivals, now), name)
+        for name, sensor in zip(config.sensors, state.sensors, strict=True)
+    ]
+    age_s, name = max(ages, default=(0.0, ""))
+    return Fault(NO_DATA, age_s, config.scan_age_s, name)
+
+
+def _find_lost_estimate(config: GateConfig, state: GateState, now: float) -> Fault:
+    fault = state.estimates.fault
+    if not fault or not config.estimate_required:
+        return NO_FAULT
+    return Fault(f"{fault}; {estimate.REMEDY}")
+
+
+def _find_unknown_scan(config: GateConfig, state: GateState, now: float) -> Fault:
+    if state.pending is None or state.pending_s is None:
+        return NO_FAULT
+    if now - state.pending_s <= config.race_s and state.command is not None:
+        return NO_FAULT  # it may be in transit
+    return Fault(f"the scan behind it ({state.pending.stamp_ns}) never arrived")
+
+
+STOPS: tuple[Rule, ...] = (
+    Rule("e_stop_pressed", E_STOP, _find_press, latches=True),
+    Rule(
+        "disarmed",
+        "",
+        lambda config, state, now: Fault(
+            "" if state.armed else "call ~/arm to let commands pass"
+        ),
+    ),
+    # The gate's clock can't be trusted, or the gate was asleep.
+    Rule("own_clock", "", lambda config, state, now: Fault(state.clock_fault)),
+    # A silent emergency stop may be a cut cable.
+    Rule("e_stop_silent", E_STOP, _find_silent_e_stop, latches=True, needs_clock=True),
+    # The stamps of a sensor lie in the future, or far back.
+    Rule(
+        "stamps_jumped",
+        "",
+        lambda config, state, now: Fault(
+            state.jumped and "its stamps have jumped, or run ahead of time",
+            topic=state.jumped,
+        ),
+        latches=True,
+    ),
+    # Odometry reports a pose that the robot can't have reached.
+    Rule(
+        "odom_jumped", ODOM, lambda config, state, now: Fault(state.leap), latches=True
+    ),
+    # The same scan repeats although odometry shows motion.
+    Rule(
+        "scan_frozen",
+        SCAN,
+        lambda config, state, now: Fault(state.frozen),
+        latches=True,
+    ),
+    # The robot is commanded to move but odometry shows none: stuck, unpowered, or frozen data.
+    Rule(
+        "no_motion",
+        ODOM,
+        lambda config, state, now: Fault(frozen.find_stuck(config, state, now)),
+        latches=True,
+        needs_clock=True,
+    ),
+    # The scans show none of the motion of odometry: the body is held, its wheels spin.
+    Rule(
+        "body_held",
+        SCAN,
+        lambda config, state, now: Fault(state.scan_motion.held),
+        latches=True,
+    ),
+    # The estimate jumped or quickly became uncertain: its localiser is lost.
+    Rule("estimate_lost", ESTIMATE, _find_lost_estimate, latches=True),
+    # Two publishers command the robot alternately.
+    Rule(
+        "two_policies", RAW, lambda config, state, now: Fault(state.mixed), latches=True
+    ),
+    # The lidar, an additional sensor, or odometry has stopped.
+    Rule(
+        "scan_silent",
+        SCAN,
+        lambda config, state, now: Fault(
+            NO_DATA, compute_age(state.scans, now), config.scan_age_s
+        ),
+    ),
+    Rule("sensor_silent", "", _find_silent_sensor),
+    Rule(
+        "odom_silent",
+        ODOM,
+        lambda config, state, now: Fault(
+            NO_DATA, compute_age(state.odometries, now), config.odom_age_s
+        ),
+    ),
+    Rule("command_malformed", RAW, lambda config, state, now: Fault(state.malformed)),
+    Rule(
+        "command_missing",
+        RAW,
+        lambda config, state, now: Fault(
+            "no command yet" if state.command is state.pending is None else ""
+        ),
+    ),
+    # The policy has stopped, or hangs.
+    Rule(
+        "command_silent",
+        RAW,
+        lambda config, state, now: Fault(
+            "" if state.command is None else "no fresh command",
+            now - state.command_s,
+            config.command_age_s,
+        ),
+    ),
+    # Commands name scans that do not arrive, perhaps from the future.
+    Rule("scan_behind_unknown", RAW, _find_unknown_scan),
+    # The scan behind the command is old, however fresh the command: a republisher, or a hang.
+    Rule(
+        "scan_behind_old",
+        SCAN,
+        lambda config, state, now: Fault(
+            "" if state.command is None else f"the scan behind {RAW} is old",
+            now - state.behind_s,
+            config.scan_age_s,
+        ),
+    ),
+)
+"""The first rule that finds a fault names the stop; the first latching one latches it."""

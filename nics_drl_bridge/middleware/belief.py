@@ -49,14 +49,10 @@ def find_max_speeds(model: SimulatorModel) -> tuple[float, float]:
     variables = (*model.robot.state, *model.robot.command)
     low = np.array([variable.min for variable in variables])
     high = np.array([variable.max for variable in variables])
-    count = len(variables)
     levels = SPEED_LEVELS
-    if levels**count > MAX_COMBINATIONS:
-        levels = 2
-    if levels**count > MAX_COMBINATIONS:
-        x = np.random.default_rng(0).uniform(low, high, (MAX_COMBINATIONS, count))
-    else:
-        x = np.array(list(product(*np.linspace(low, high, levels).T)))
+    if levels ** len(variables) > MAX_COMBINATIONS:
+        levels = 2  # only the ends
+    x = np.array(list(product(*np.linspace(low, high, levels).T)))
     states = len(model.robot.state)
     x[:, states:] = model.kinematics.apply_curves(x[:, states:])
     twist = model.kinematics.rates(x)[:, :3]

@@ -302,16 +302,6 @@ class Estimator:
         self._rate_error_jacobian = rate_error_jacobian
         self._twist = twist
 
-    def update(
-        self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None
-    ) -> Judgement:
-        """Corrects by a measured value (n,) with deviations `std` (n,), by default the model's."""
-        noise = None
-        if std is not None:
-            noise = np.diag(np.atleast_1d(std) ** 2.0)
-        measured = np.atleast_1d(value).astype(np.float64)
-        return self.correct(Measurement(kind, measured, noise))
-
     def take_yaw_rate(self, time_ns: int, measurement: Measurement) -> Judgement:
         """Takes a yaw rate measured at a time [ns]; the next odometry fuses it, see `turning`."""
         variance = None

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from parts.gates import gate_config
 
 from nics_drl_bridge.config import find_config, parse_yaml, read_text
-from nics_drl_bridge.gate.assurance.gate_loop import Gate
 from nics_drl_bridge.gate.assurance.limit_judge import VIOLATIONS, LimitJudge
+from nics_drl_bridge.gate.gate_loop import Gate
 from nics_drl_bridge.gate.inputs import Press
 from nics_drl_bridge.gate.limits import Limits
 from nics_drl_bridge.lidar.spec import LidarSpec

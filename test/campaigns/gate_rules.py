@@ -12,16 +12,17 @@ import sys
 
 from campaign import ROOT, Given, Result, run_campaign
 
-from nics_drl_bridge.gate import arming, evidence, gate, intake
+from nics_drl_bridge.gate import arming, evidence, gate, intake, stops
 
 LEAST_RULES = 30
 """There are more; a run that found fewer has lost a table."""
 TESTS = "test/gate"
+UNTESTED = "covers_nothing"  # a rule that stops nothing: nobody can miss it
 OTHER_TEST = "test/gate/test_stopping.py"
 TABLES = {
-    "stop": (gate, "STOPS", lambda rule: rule.judge.__name__),
+    "stop": (stops, "STOPS", lambda rule: rule.name),
     "refusal": (intake, "REFUSALS", lambda rule: rule[1].__name__),
-    "arming": (arming, "CHECKS", lambda check: check[0]),
+    "arming": (arming, "CHECKS", str),
     "shaping": (gate, "SHAPERS", lambda shaper: shaper.__name__),
     "evidence": (evidence, "EVIDENCE", lambda place: place.__name__),
 }
@@ -41,19 +42,17 @@ def take_out(name: str) -> None:
     kind, _, rule = name.partition("/")
     module, table, name_of = TABLES[kind]
     rows = getattr(module, table)
-    kept = tuple(row for row in rows if name_of(row) != rule)
+    kept = [row for row in rows if name_of(row) != rule]
     if len(kept) != len(rows) - 1:
         raise SystemExit(f"there is no rule {name!r}; known are {', '.join(names())}")
-    setattr(module, table, kept)
-
-
-def _covers_nothing(config: object, state: object, now: float) -> None:
-    """A rule that stops nothing: nobody can miss it."""
+    is_named = isinstance(rows, dict)
+    setattr(module, table, {key: rows[key] for key in kept} if is_named else kept)
 
 
 def add_untested() -> None:
     """Puts a rule that no test covers into the table of stops, in this process."""
-    gate.STOPS = (*gate.STOPS, gate.Rule(_covers_nothing))
+    nothing = stops.Rule(UNTESTED, "", lambda config, state, now: stops.NO_FAULT)
+    stops.STOPS = (*stops.STOPS, nothing)
 
 
 def tests_fail_without(name: str | None, control: str, tests: str) -> bool:
@@ -92,7 +91,7 @@ def measure(given: Given) -> Result:
     known = names()
     asked = known if given.rule is None else given.rule
     if control == "untested_rule":
-        asked = [name for name in known if name.endswith(_covers_nothing.__name__)]
+        asked = [name for name in known if name.endswith(UNTESTED)]
     untested = [
         name for name in asked if not tests_fail_without(name, control, given.tests)
     ]

@@ -9,15 +9,15 @@ from robots import direct_model
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands import demo_run
-from nics_drl_bridge.commands.demo_run import (
-    FAST,
-    DemoEpisodes,
+from nics_drl_bridge.commands.demo_report import (
     DemoPlan,
+    DemoResults,
     Learned,
-    derive_settings,
-    learn,
+    format_episodes,
     make_sections,
+    make_verdict,
 )
+from nics_drl_bridge.commands.demo_run import FAST, Demo
 from nics_drl_bridge.confidence import ConfidenceInterval, estimate_rate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model, generate, mount_lidar
@@ -37,22 +37,13 @@ def without_torch(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "robot",
-    [
-        "differential",
-        *(
-            pytest.param(name, marks=pytest.mark.campaign)
-            for name in ("ackermann", "mecanum")
-        ),
-    ],
-)
 def test_without_the_extra_the_shipped_policy_of_the_robot_drives(
-    tmp_path, without_torch, robot
+    tmp_path, without_torch
 ):
+    robot = "differential"
     pytest.importorskip("onnxruntime")
     said: list[str] = []
-    learned = learn(DemoPlan(tmp_path, robot), builtin_model(robot), said.append)
+    learned = Demo(DemoPlan(tmp_path, robot), said.append).learn(builtin_model(robot))
     assert learned.policy == robot
     assert learned.curve == ()
     (sentence,) = said
@@ -63,12 +54,12 @@ def test_without_the_extra_the_shipped_policy_of_the_robot_drives(
 
 def test_a_named_policy_is_taken_and_a_misspelt_one_refused(tmp_path):
     model = direct_model()
-    learned = learn(DemoPlan(tmp_path, policy="straight"), model, pytest.fail)
+    learned = Demo(DemoPlan(tmp_path, policy="straight"), pytest.fail).learn(model)
     assert learned.policy == "straight"
     with pytest.raises(
         ConfigError, match="unknown policy 'strait'; did you mean 'straight'"
     ):
-        learn(DemoPlan(tmp_path, policy="strait"), model, pytest.fail)
+        Demo(DemoPlan(tmp_path, policy="strait"), pytest.fail).learn(model)
 
 
 def episode(seed, result="success"):
@@ -81,39 +72,48 @@ def episode(seed, result="success"):
 def generated():
     """A model and the report on how it was identified."""
     robot = load_robot("differential")
-    drive = record(robot, np.random.default_rng(0), 30.0)
+    drive = record(robot, np.random.default_rng(0), 10.0)
     return generate(drive, robot, mount_lidar(robot), ())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("share", "arrived"), [(0.986, True), (0.42, False)])
-def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
-    generated, tmp_path, share, arrived
-):
-    model, identified = generated
+def results(generated, folder, share, arrived):
+    """A demo that succeeds with a fraction of its episodes."""
     arrivals = int(500 * share)
     rates = [
         estimate_rate(count, 500) for count in (arrivals, 500 - arrivals, 0, arrivals)
     ]
     length = ConfidenceInterval(3.0, 2.9, 3.1)
     summary = Summary(500, *rates, length, length)
-    live = episode(0, "success" if arrived else "time-out")
     points = [Point(8192, 0.1, 0.8), Point(80_000, 0.9, 0.1)]
-    learned = Learned("policy.onnx", "PPO learned it.", points)
-    summaries = {"as it is": summary, "lidar": summary}
-    of = DemoEpisodes(
-        summaries, [episode(0), episode(1)], [episode(0), episode(1)], live
+    episodes = [episode(0), episode(1)]
+    return DemoResults(
+        DemoPlan(folder),
+        *generated,
+        Learned("policy.onnx", "PPO learned it.", points),
+        {"as it is": summary, "lidar": summary},
+        episodes,
+        episodes,
+        episode(0, "success" if arrived else "time-out"),
     )
-    sections = dict(make_sections(DemoPlan(tmp_path), model, identified, learned, of))
-    assert next(iter(sections)) == "Verdict"
-    verdict = "".join(sections["Verdict"])
-    for words in (
-        f"{100 * share:.1f} %",
-        "2 of 2",
-        "arrived" if arrived else "did not arrive",
-    ):
+
+
+@pytest.mark.parametrize(
+    ("share", "arrived", "end", "warnings"),
+    [(0.986, True, "arrived", 0), (0.42, False, "did not arrive", 2)],
+)
+def test_the_verdict_tells_the_success_in_three_worlds(
+    generated, tmp_path, share, arrived, end, warnings
+):
+    verdict = "".join(make_verdict(results(generated, tmp_path, share, arrived)))
+    for words in (f"{100 * share:.1f} %", "2 of 2", end):
         assert words in verdict
-    assert verdict.count("⚠") == (0 if arrived else 2)
+    assert verdict.count("⚠") == warnings
+
+
+@pytest.mark.slow
+def test_the_report_begins_with_its_verdict_and_folds_the_figures(generated, tmp_path):
+    sections = dict(make_sections(results(generated, tmp_path, 0.986, True)))
+    assert next(iter(sections)) == "Verdict"
     assert "".join(sections["Paths in the world"]).count("<img") == 1
     everything = "".join("".join(blocks) for blocks in sections.values())
     assert "Cross-validated" in everything
@@ -122,7 +122,7 @@ def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
 
 def test_it_trains_in_the_world_and_simulator_of_the_plan(tmp_path):
     plan = DemoPlan(tmp_path, world="circles", train_steps=7)
-    settings, told, _ = derive_settings(plan, direct_model())
+    settings, told, _ = Demo(plan, print).derive_settings(direct_model())
     assert told == ()
     assert settings.robot == str(tmp_path / "model")
     assert settings.worlds == {"circles": 512}
@@ -130,28 +130,26 @@ def test_it_trains_in_the_world_and_simulator_of_the_plan(tmp_path):
 
 
 def test_without_ros_it_drives_in_process_alone_and_says_so(tmp_path, monkeypatch):
-    def drive_here(plan, place, policy, say):
+    def drive_here(self, place, policy):
         assert place == FAST
         return [episode(0)]
 
     shown = []
+    learned = Learned("straight", "None was.")
     monkeypatch.setattr(demo_run, "find_spec", lambda name: None)
-    monkeypatch.setattr(demo_run, "_generate", lambda plan, say: (direct_model(), None))
+    monkeypatch.setattr(Demo, "_generate", lambda self: (direct_model(), None))
+    monkeypatch.setattr(Demo, "learn", lambda self, model: learned)
+    monkeypatch.setattr(Demo, "_evaluate", lambda self, model, name: None)
+    monkeypatch.setattr(Demo, "_drive", drive_here)
     monkeypatch.setattr(
-        demo_run, "learn", lambda *given: Learned("straight", "None was.")
-    )
-    monkeypatch.setattr(demo_run, "_evaluate", lambda *given: None)
-    monkeypatch.setattr(demo_run, "_drive", drive_here)
-    monkeypatch.setattr(
-        demo_run, "make_sections", lambda *given: shown.append(given[-1]) or []
+        demo_run, "make_sections", lambda results: shown.append(results) or []
     )
     said = list[str]()
-    line = demo_run.run(DemoPlan(tmp_path, episodes=1), said.append)
+    line = Demo(DemoPlan(tmp_path, episodes=1), said.append).run()
     assert line == f"demo: in process 1/1, report {tmp_path / 'report.html'}"
     assert said[0].startswith("only in process: ")
     assert "needs the module 'rclpy'" in said[0]
-    (of,) = shown
-    assert (of.there, of.live) == ([], None)
-    paths = demo_run._format_episodes(DemoPlan(tmp_path), direct_model(), of)
-    assert "1 of 1 episodes reached the goal in process." in "".join(paths)
-    assert "DDS" not in "".join(paths)
+    assert (shown[0].there, shown[0].live) == ([], None)
+    paths = "".join(format_episodes(shown[0]))
+    assert "1 of 1 episodes reached the goal in process." in paths
+    assert "DDS" not in paths

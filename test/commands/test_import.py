@@ -23,7 +23,7 @@ def folder(tmp_path_factory):
     """A drive of a car as one table, with the names that users give."""
     room = tmp_path_factory.mktemp("log")
     drive = textbook.record(
-        load_robot("ackermann"), np.random.default_rng(0), duration=20.0
+        load_robot("ackermann"), np.random.default_rng(0), duration=10.0
     )
     row = np.searchsorted(drive.command.t, drive.pose.t + 1e-9, side="right") - 1
     command = drive.command.values[np.clip(row, 0, None)]

@@ -37,7 +37,7 @@ def absent(monkeypatch):
     ("name", "said"),
     [
         ("tf_msgs", "unknown message package 'tf_msgs'; did you mean 'tf2_msgs'?"),
-        ("leg_msgs", "leg_msgs: holds none of msg/*.msg, srv/*.srv, action/"),
+        ("leg_msgs", "leg_msgs: contains none of msg/*.msg, srv/*.srv, action/"),
         ("tf2_msgs", "sudo apt install cmake make g++"),
         ("ackermann_msgs", "sudo apt install ros-kilted-ackermann-msgs"),
     ],
@@ -61,7 +61,7 @@ def test_what_is_installed_is_left_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(install, "check_import", lambda name: None)
     done = nics("install tf2_msgs", cwd=tmp_path)
     assert done.returncode == 0
-    assert done.stdout == "tf2_msgs is installed already\n"
+    assert done.stdout == "tf2_msgs is already installed\n"
 
 
 def test_a_broken_build_is_built_again(tmp_path, monkeypatch):
@@ -103,7 +103,7 @@ def test_a_package_has_the_name_in_its_package_xml(tmp_path):
     files = {"msg/Arm.msg": "int32 x\n"}
     assert write_package(tmp_path / "arms-main", files, "arm_msgs").name == "arm_msgs"
     assert write_package(tmp_path / "leg_msgs", files).name == "leg_msgs"
-    with pytest.raises(ConfigError, match="'legs-main' is no name of a package"):
+    with pytest.raises(ConfigError, match="'legs-main' is not a valid package name"):
         write_package(tmp_path / "legs-main", files)
 
 
@@ -125,14 +125,14 @@ def test_a_package_can_use_one_that_was_just_built(generators, tmp_path):
     legs = write_package(tmp_path / "leg_msgs", {"msg/Leg.msg": "arm_msgs/Arm arm\n"})
     arms = write_package(tmp_path / "arm_msgs", {"msg/Arm.msg": "int32 x\n"})
     assert message_build.sort_by_use([legs, arms]) == [arms, legs]
-    with pytest.raises(ConfigError, match="holds no"):
+    with pytest.raises(ConfigError, match="contains no"):
         generators.find_interfaces(legs)
     generators.build(generators.find_interfaces(arms), tmp_path / "built")
     assert generators.find_interfaces(legs).needed == ["arm_msgs"]
     built = f"c{os.pathsep}{tmp_path / 'built'}"
     assert generators._environment["CMAKE_PREFIX_PATH"] == built
     write_package(tmp_path / "arm_msgs", {"msg/Arm.msg": "leg_msgs/Leg leg\n"})
-    with pytest.raises(ConfigError, match="arm_msgs and leg_msgs need each other"):
+    with pytest.raises(ConfigError, match="arm_msgs and leg_msgs depend on each other"):
         message_build.sort_by_use([legs, arms])
 
 

@@ -27,22 +27,26 @@ def invoke(*words):
 def test_a_preview_tells_and_draws_the_drive_and_needs_no_ros(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rclpy", None)
     monkeypatch.chdir(tmp_path)
-    done = invoke("--preview --duration 20 --out new/drive.npz")
+    done = invoke("--preview --duration 20 --out new/drive.npz --json")
     assert done.exit_code == 0, done.output
-    told = done.stdout.splitlines()
+    facts = json.loads(done.stdout)
+    told = facts.pop("told")
+    assert facts == {"out": "new/drive.npz", "robot": DEFAULT_ROBOT}
     assert told[0].startswith("preview of 20 s: a path of ")
     assert told[-1] == "its path is drawn in new/drive_preview.png"
     assert (tmp_path / "new" / "drive_preview.png").read_bytes().startswith(PNG)
     assert os.listdir(tmp_path / "new") == ["drive_preview.png"]
-    facts = json.loads(
-        invoke("--preview --duration 20 --out new/drive.npz --json").stdout
-    )
-    assert facts == {"out": "new/drive.npz", "robot": DEFAULT_ROBOT, "told": told}
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """A drive without its preview, which takes seconds."""
+    monkeypatch.setattr(model, "draw_preview", lambda plan, out: ())
 
 
 @pytest.mark.ros
 @pytest.mark.parametrize("as_json", [False, True])
-def test_it_asks_before_the_robot_moves(tmp_path, monkeypatch, as_json):
+def test_it_asks_before_the_robot_moves(tmp_path, monkeypatch, undrawn, as_json):
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
     monkeypatch.chdir(tmp_path)
     done = invoke("--duration 20 --out drive.npz", "--json" if as_json else "")
@@ -52,7 +56,9 @@ def test_it_asks_before_the_robot_moves(tmp_path, monkeypatch, as_json):
         facts = json.loads(done.stdout.splitlines()[-1])
         assert facts == {"out": "drive.npz", "robot": DEFAULT_ROBOT, "recorded": False}
     else:
-        assert done.stdout.endswith("nothing was driven or recorded.\n")
+        assert done.stdout.endswith(
+            "the robot was not driven, and nothing was recorded.\n"
+        )
     assert "drive.npz" not in os.listdir(tmp_path)
 
 
@@ -76,12 +82,16 @@ def test_options_become_arguments_of_the_node():
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize("complete", [True, False])
-def test_an_outcome_becomes_lines_or_an_error(monkeypatch, tmp_path, complete):
+@pytest.mark.parametrize(
+    ("complete", "failure", "code"),
+    [(True, None, 0), (False, None, 130), (True, BackendError("odom"), 2)],
+)
+def test_an_outcome_becomes_lines_or_an_error(
+    monkeypatch, tmp_path, undrawn, complete, failure, code
+):
     record_node = pytest.importorskip("nics_drl_bridge.nodes.record_node")
-    for failure, code in ((None, 0 if complete else 130), (BackendError("odom"), 2)):
-        outcome = record_node.DriveResult(complete, failure, None, "over")
-        monkeypatch.setattr(record_node, "record", lambda *_, outcome=outcome: outcome)
-        done = invoke("--yes --duration 20 --out", tmp_path / "drive.npz")
-        assert done.exit_code == code
-        assert done.output.endswith("over\n")
+    outcome = record_node.DriveResult(complete, failure, None, "over")
+    monkeypatch.setattr(record_node, "record", lambda *_: outcome)
+    done = invoke("--yes --duration 20 --out", tmp_path / "drive.npz")
+    assert done.exit_code == code
+    assert done.output.endswith("over\n")

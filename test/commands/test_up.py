@@ -144,12 +144,6 @@ class Up:
         with mock.patch.dict(os.environ, self.environment):
             return nics(words, cwd=self.log.parent)
 
-    def tell_by_process(self, words: str) -> subprocess.CompletedProcess[str]:
-        command = [*NICS, *words.split()]
-        return subprocess.run(
-            command, env=self.environment, capture_output=True, text=True
-        )
-
     def end(self, number: int) -> int:
         self.process.send_signal(number)
         return self.process.wait(ENDED_S)
@@ -210,7 +204,7 @@ def test_a_simulation_is_armed_driven_stopped_and_ended_by_nics_alone(start):
     assert "nics arm" in up.text
     with Witness(domain_id) as witness:
         assert witness.sees(ENDED_S)
-        armed = up.tell_by_process("arm")
+        armed = up.tell("arm")
         assert armed.returncode == 0, armed.stderr
         assert "/command_gate is armed" in armed.stdout
         goal = up.tell("goal 0.8 -0.3 --wait 90")
@@ -238,19 +232,22 @@ def test_a_simulation_is_armed_driven_stopped_and_ended_by_nics_alone(start):
     assert "Traceback" not in up.text
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_that_would_end_it_at_once_ends_its_nodes_first(number):
+    before = signal.signal(number, signal.SIG_DFL)
+    try:
+        with pytest.raises(SystemExit) as end, up.end_nodes_by_signals():
+            signal.raise_signal(number)
+        assert end.value.code == 128 + number
+        assert signal.getsignal(number) is signal.SIG_DFL
+    finally:
+        signal.signal(number, before)
+
+
 @linux
-@pytest.mark.ros
-@pytest.mark.process
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize(
-    "number",
-    [
-        signal.SIGTERM,
-        pytest.param(signal.SIGKILL, marks=pytest.mark.campaign),
-        pytest.param(signal.SIGHUP, marks=pytest.mark.campaign),
-    ],
-)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, signal.SIGHUP])
 def test_no_node_outlives_it_whatever_signal_ends_it(start, number):
     up, _ = start("simulator", "world:=empty")
     up.runs("simulator_node")
@@ -269,7 +266,7 @@ def test_a_node_that_can_not_start_ends_the_others_with_its_sentence(start):
     up, _ = start("simulation", "policy:=dynamic_widow")
     assert up.process.wait(COMPILED_S) == 2
     assert "unknown policy 'dynamic_widow'; did you mean 'dynamic_window'?" in up.text
-    assert "policy_node ended with code 2, so everything was ended" in up.text
+    assert "policy_node ended with code 2, so all nodes were ended" in up.text
 
 
 @pytest.mark.ros

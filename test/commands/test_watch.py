@@ -12,7 +12,7 @@ import pytest
 import typer
 from watch.rig import Client, source
 
-from nics_drl_bridge.commands import console
+from nics_drl_bridge.commands import console, train
 from nics_drl_bridge.commands import watch as module
 
 
@@ -69,8 +69,29 @@ def test_the_command_shows_a_policy_driving_until_ctrl_c(tmp_path):
         assert process.wait(30.0) == 130
 
 
+def test_a_watched_training_shows_each_env_and_what_it_does(monkeypatch):
+    views = []
+
+    def show(server, env):
+        views.append(SimpleNamespace(env=env))
+        return views[-1]
+
+    def run(run, order, learn, as_json, note):
+        learn()
+        note("half of it")
+
+    monkeypatch.setattr("nics_drl_bridge.watch.training.TrainingView", show)
+    monkeypatch.setattr("nics_drl_bridge.watch.show.open_page", lambda url: None)
+    monkeypatch.setattr(train, "_run", run)
+    env = SimpleNamespace()
+    train._run_watched(None, None, lambda on_env: on_env(env), False)
+    assert env.on_step is views[0]
+    assert views[0].env is env
+    assert views[0].note == "half of it"
+
+
+@pytest.mark.campaign
 @pytest.mark.process
-@pytest.mark.slow
 def test_a_training_shows_its_worlds(tmp_path):
     pytest.importorskip("torch", reason="needs the extra train")
     words = ("train", "--world", "circles", "--steps", "200000", "--watch")

@@ -95,7 +95,7 @@ def test_several_files_go_to_a_folder_all_or_none(tmp_path):
     assert "--out x.yaml: is for one" in refused(words, "--out x.yaml", cwd=tmp_path)
     assert "all/a.yaml: already exists" in refused(words, "--out all", cwd=tmp_path)
     sdf(tmp_path, DISC, name="a.sdf")
-    assert "two files would be" in refused("import a.world a.sdf", cwd=tmp_path)
+    assert "two worlds would be" in refused("import a.world a.sdf", cwd=tmp_path)
 
 
 def test_a_map_of_nav2_becomes_a_world_that_refers_to_it(tmp_path):
@@ -151,11 +151,11 @@ def test_neither_picture_nor_map_replaces_a_file_that_the_world_is_made_of(tmp_p
 def test_a_world_of_too_many_bodies_is_refused_by_the_file_that_holds_them(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(config, "MAX_VALUES", 1000)
-    boxes = [f"<box><size>{0.1 + 1e-5 * k:.5f} 0.1 1</size></box>" for k in range(200)]
+    monkeypatch.setattr(config, "MAX_VALUES", 200)
+    boxes = [f"<box><size>{0.1 + 1e-5 * k:.5f} 0.1 1</size></box>" for k in range(40)]
     many = refused("import", sdf(tmp_path, *boxes), "--out made.yaml", cwd=tmp_path)
     assert many.startswith(
-        "my.world: its 200 bodies make a file that is too large to be read; "
+        "my.world: its 40 bodies make a file that is too large to be read; "
     )
     assert not (tmp_path / "made.yaml").exists()
 

@@ -19,6 +19,11 @@ from digests.projection import projected
 from gate.rig import config
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import evidence, frozen, shield_kernels, stopping
+from nics_drl_bridge.gate.assurance.episodes import configure_gate
+from nics_drl_bridge.gate.assurance.episodes import drive as drive_episode
+from nics_drl_bridge.gate.assurance.limit_judge import LimitJudge
+from nics_drl_bridge.gate.assurance.place import POLICY, Job, Place
+from nics_drl_bridge.gate.assurance.protocol import KINDS
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.inputs import (
     Arm,
@@ -67,6 +72,8 @@ FAULTS = (
     *("called", "held", "stuck", "frozen", "blind", "late", "ahead", "back", "lost"),
     *("uncertain", "leap", "wild", "unknown", "broken", "two", "many", "stopped"),
 )
+# Robot, shield, number of beams, and changes of the configuration. Every robot has some of the
+# faults, the first and the third have all of them.
 DRIVES = {
     "circle": ("differential", ROUND, 360, {}),
     "car": (
@@ -83,6 +90,12 @@ DRIVES = {
         90,
         {"simulated": True, "e_stop_required": False, "estimate_required": False},
     ),
+}
+
+SOME_FAULTS = {
+    "car": FAULTS[::2],
+    "drifting": FAULTS[1::2],
+    "simulated": FAULTS[::3],
 }
 
 
@@ -135,6 +148,7 @@ class FaultyDrive:
                 "odom_age_s": 0.25,
                 "command_age_s": 0.25,
                 "race_s": 0.0625,
+                "settle_s": 0.5,
                 "gap_s": 0.25,
                 "frozen_distance": 0.25,
                 "stop_when_held": True,
@@ -223,7 +237,7 @@ class FaultyDrive:
                 self.send()
             decision = self.give(Tick())
             self.twist = decision.twist * (self.fault != "stuck")
-            if self.units % 16 == 0:
+            if self.units % 32 == 0:
                 self.sums.append(projected(flatten(self.state)))
 
     def break_down(self, fault, units=70):
@@ -233,7 +247,7 @@ class FaultyDrive:
         self.give(Reset())
         self.run(16)
         self.give(Arm(2))
-        self.run(60)
+        self.run(36)
         self.give(Arm(1))
         self.run(30)
         self.fault = fault
@@ -245,7 +259,7 @@ class FaultyDrive:
 def record_drive(name):
     """Yields what was decided around each fault, and the numbers of all states."""
     drive = FaultyDrive(*DRIVES[name])
-    for fault in FAULTS:
+    for fault in SOME_FAULTS.get(name, FAULTS):
         drive.break_down(fault)
         told = [(*each.twist, each.publish, each.shielded) for each in drive.decisions]
         yield drive.lines, [projected(told), *drive.sums]
@@ -336,12 +350,28 @@ def record_settings():
     yield lines, []
 
 
+def record_episodes():
+    """Yields how episodes of all drivers end, behind a gate and without one."""
+    model = builtin_model("differential")
+    bounds = load_limits("differential", model.robot)
+    place = Place(model, "crowd", "straight")
+    for seed, kind in enumerate(KINDS):
+        for settings in (None, configure_gate(place.model, "differential")):
+            if settings is not None and kind == POLICY:
+                continue  # its episode is long
+            judge = LimitJudge(model.robot, bounds)
+            outcome = drive_episode(place, settings, Job(kind, seed), judge.see)
+            counts = list(judge.violations.values())
+            yield [outcome.latched], [flatten(outcome), counts]
+
+
 RECORDS = {
     **{name: partial(record_drive, name) for name in DRIVES},
     "stops": record_stops,
     "evidence": record_evidence,
     "limits": record_limits,
     "settings": record_settings,
+    "episodes": record_episodes,
 }
 
 

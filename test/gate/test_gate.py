@@ -20,23 +20,14 @@ from nics_drl_bridge.interface import NS_PER_S
 WITHIN_S = 0.40
 
 
-def test_a_gate_that_nobody_armed_lets_nothing_pass():
-    rig = Rig()
-    rig.run(3.0)
-    assert rig.rule == "disarmed"
-    assert not any(twist.any() for _, twist in rig.published)
-
-
-def test_the_robot_drives_on_when_data_are_fresh_again():
-    rig = driving()
-    rig.until_stopped(WITHIN_S, without="scan command")
-    assert rig.run(1.0).cause is None
-    assert rig.moves
-
-
-@pytest.mark.parametrize("required", [True, False])
-def test_an_e_stop_that_was_heard_and_falls_silent_counts_as_pressed(required):
-    rig = driving(e_stop_required=required)
+def test_an_optional_e_stop_that_was_heard_and_falls_silent_counts_as_pressed():
+    rig = Rig(config(e_stop_required=False))
+    rig.run(2.0, without="e_stop")
+    assert rig.arm().granted
+    rig.speed = 0.5
+    rig.run(1.0, without="e_stop")
+    assert rig.moves  # none was ever heard
+    rig.run(0.5)
     rig.until_stopped(WITHIN_S, without="e_stop")
     rig.speed = 0.0
     rig.run(2.0)
@@ -46,13 +37,34 @@ def test_an_e_stop_that_was_heard_and_falls_silent_counts_as_pressed(required):
     assert "e_stop_silent" in rig.arm().answer
 
 
-def test_without_an_e_stop_required_one_that_was_never_heard_means_nothing():
-    rig = Rig(config(e_stop_required=False))
-    rig.run(2.0, without="e_stop")
+def test_an_e_stop_stops_at_once_until_it_is_released_reset_and_armed():
+    rig = driving()
+    assert rig.give(EStop(True)).publish
+    assert not rig.moves
+    assert not rig.give(Reset()).granted
+    assert "still pressed" in rig.decision.answer
+    rig.speed = 0.0
+    rig.run(2.0)
+    assert rig.rule == "e_stop_pressed"
+    assert rig.give(Reset()).granted
+    rig.run(2.0)
+    assert rig.rule == "disarmed"
+    assert not rig.moves
     assert rig.arm().granted
-    rig.speed = 0.5
-    rig.run(1.0, without="e_stop")
+    rig.run(0.5)
     assert rig.moves
+    rig.give(Press())
+    rig.run(1.0)  # its topic says that it is released
+    assert rig.rule == "e_stop_pressed"
+    assert rig.give(Reset()).granted
+
+
+def test_a_press_by_a_call_is_no_heartbeat():
+    rig = Rig()
+    rig.run(1.5, without="e_stop")
+    rig.give(Press())
+    rig.give(Reset())
+    assert "e_stop_silent" in rig.arm().answer
 
 
 def test_before_the_first_command_nothing_moves():
@@ -79,45 +91,27 @@ def test_a_republisher_does_not_hide_a_policy_that_hangs():
     assert rig.rule == "scan_behind_old"
 
 
-def test_a_command_that_overtakes_its_scan_does_not_stop_the_robot():
+def test_a_command_that_overtakes_its_scan_waits_for_it():
     rig = driving()
     rig.run(0.06, without="scan command")
     rig.stamp += 1
-    rig.wish = np.array([0.3, 0.0, 0.0])
-    rig.command()
+    arrival_s = rig.now
+    rig.command([0.3, 0.0, 0.0])
     rig.now += TICK_S
     assert rig.tick().cause is None
     assert rig.state.command.twist[0] == 0.5
     rig.scan()
     assert rig.state.command.twist[0] == 0.3
-    assert rig.tick().cause is None
-
-
-def test_a_command_that_waits_for_its_scan_does_not_undo_a_later_malformed_one():
-    rig = driving()
-    rig.run(0.06, without="scan command")
+    assert (rig.state.pending, rig.state.command_s) == (None, arrival_s)
     rig.stamp += 1
-    rig.command([0.3, 0.0, 0.0])
+    rig.command([0.4, 0.0, 0.0])
     rig.command([np.nan, 0.0, 0.0])
-    rig.scan()
+    rig.scan()  # does not undo the malformed one
     assert rig.rule == "command_malformed"
-    assert rig.state.command.twist[0] == 0.5
+    assert rig.state.command.twist[0] == 0.3
     rig.command([0.2, 0.0, 0.0])
     rig.now += TICK_S
     assert rig.tick().cause is None
-    assert rig.state.command.twist[0] == 0.2
-
-
-def test_the_age_of_a_command_counts_from_its_arrival_although_its_scan_came_later():
-    rig = driving()
-    rig.run(0.06, without="scan command")
-    rig.stamp += 1
-    arrival_s = rig.now
-    rig.command()
-    rig.now += 2.0 * TICK_S
-    rig.scan()
-    assert rig.state.pending is None
-    assert rig.state.command_s == arrival_s
 
 
 @pytest.mark.parametrize(
@@ -152,6 +146,8 @@ def test_a_broken_command_stops_the_robot_at_once_and_feeds_no_watchdog(twist, w
         ("odom", {"pose": np.array([np.nan, 0.0, 0.0])}),
         ("odom", {"twist": np.array([0.0, np.inf, 0.0])}),
         ("odom", {"twist": np.array([1e6, 0.0, 0.0])}),
+        ("scan", {"stamp_ns": 0}),  # that of the newest
+        ("odom", {"stamp_ns": 0}),
     ],
 )
 def test_data_that_are_none_of_this_robot_are_refused_and_feed_no_watchdog(
@@ -161,6 +157,8 @@ def test_data_that_are_none_of_this_robot_are_refused_and_feed_no_watchdog(
     rig.now += TICK_S
     rig.stamp += 1
     before = (rig.state.scans, rig.state.odometries)
+    if "stamp_ns" in changes:
+        changes = {"stamp_ns": rig.stamp - 1}
     assert getattr(rig, topic)(**changes).refused
     assert (rig.state.scans, rig.state.odometries) == before
 
@@ -172,23 +170,7 @@ def test_stamps_that_jump_latch_a_stop(jump_s, topic):
     rig.now += TICK_S
     getattr(rig, topic)(stamp_ns=rig.stamp + round(jump_s * NS_PER_S))
     assert (rig.rule, rig.decision.cause.topic) == ("stamps_jumped", topic)
-    rig.stamp += round(jump_s * NS_PER_S)
-    rig.run(2.0)
-    assert not rig.moves
-
-
-@pytest.mark.parametrize("topic", ["scan", "odom"])
-def test_stamps_that_freeze_are_no_new_data(topic):
-    rig = driving()
-    frozen = rig.stamp
-    before = len(rig.published)
-    for _ in range(30):
-        rig.run(TICK_S, without=topic)
-        getattr(rig, topic)(stamp_ns=frozen)
-    assert not rig.moves
-    assert rig.rule == f"{topic}_silent"
-    late = [time for time, twist in rig.published[before:] if twist.any()]
-    assert max(late) - rig.published[before][0] <= WITHIN_S
+    assert rig.state.latched is not None
 
 
 @pytest.mark.parametrize("now", [np.nan, np.inf, -np.inf, 0.0, 99.0])
@@ -198,11 +180,10 @@ def test_a_clock_that_tells_nonsense_or_runs_back_stops_the_robot(now):
     assert not rig.moves
 
 
-def test_a_clock_that_stands_still_stops_the_robot():
+def test_a_clock_that_stands_still_for_twenty_inputs_stops_the_robot():
     rig = driving()
-    for _ in range(FROZEN_INPUTS + 5):
-        rig.tick()
-    assert rig.rule == "own_clock"
+    stopped = [rig.tick().cause is not None for _ in range(FROZEN_INPUTS)]
+    assert stopped == [False] * (FROZEN_INPUTS - 1) + [True]
 
 
 @pytest.mark.parametrize("first", ["scan", "odom", "command", "e_stop", "tick"])
@@ -245,48 +226,6 @@ def test_data_that_queued_up_while_the_gate_was_asleep_latch_nothing(simulated):
     assert rig.state.latched is None
     rig.speed = 0.0
     assert rig.run(0.5).cause is None
-
-
-def test_the_e_stop_stops_at_once_and_a_reset_alone_moves_nothing():
-    rig = driving()
-    decision = rig.give(EStop(True))
-    assert decision.cause.rule == "e_stop_pressed"
-    assert decision.publish
-    assert not rig.moves
-    rig.speed = 0.0
-    rig.run(2.0)
-    assert rig.rule == "e_stop_pressed"
-    assert rig.give(Reset()).granted
-    rig.run(2.0)
-    assert rig.rule == "disarmed"
-    assert not rig.moves
-    assert rig.arm().granted
-    rig.run(0.5)
-    assert rig.moves
-
-
-def test_an_e_stop_pressed_by_a_call_stays_although_its_topic_says_released():
-    rig = driving()
-    assert rig.give(Press()).cause.rule == "e_stop_pressed"
-    rig.run(1.0)
-    assert rig.rule == "e_stop_pressed"
-    assert rig.give(Reset()).granted
-
-
-def test_a_call_is_no_heartbeat():
-    rig = Rig()
-    rig.run(1.5, without="e_stop")
-    rig.give(Press())
-    rig.give(Reset())
-    assert "e_stop_silent" in rig.arm().answer
-
-
-def test_a_reset_does_not_release_an_e_stop_that_is_held():
-    rig = driving()
-    rig.give(EStop(True))
-    assert not rig.give(Reset()).granted
-    assert "still pressed" in rig.decision.answer
-    assert rig.rule == "e_stop_pressed"
 
 
 def test_identical_scans_of_a_robot_that_stands_still_are_fine():

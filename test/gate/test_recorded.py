@@ -87,7 +87,7 @@ STOPPING = {
 }
 PASSING = {"scan_silent", "odom_silent", "command_silent", "sensor_silent"}
 PASSING |= {"command_malformed", "scan_behind_unknown"}
-SLOW = {"body_held": 70, "no_motion": 70, "scan_frozen": 128}
+SLOW = {"body_held": 128, "no_motion": 70, "scan_frozen": 128}
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from gate.recorded import WALLS, see
 from gate.rig import PERIOD_S, TICK_S, Rig, config
-from nics_drl_bridge.gate.inputs import Reset, Scan
+from nics_drl_bridge.gate.inputs import Scan
 from nics_drl_bridge.gate.scan_motion import warm_up
 from nics_drl_bridge.geometry import compose, exp
 from nics_drl_bridge.interface import NS_PER_S
@@ -131,18 +129,6 @@ def person(x, y, half=0.25):
     return [[x - half, y, x + half, y], [x, y - half, x, y + half]]
 
 
-def test_the_stop_stays_until_the_gate_is_reset_and_armed():
-    scene = started()
-    scene.stops_after(1.0)
-    scene.held = False
-    scene.run(2.0)
-    assert scene.rule == "body_held"
-    assert scene.give(Reset()).granted
-    assert scene.arm().granted, scene.decision.answer
-    scene.run(1.0)
-    assert scene.moves
-
-
 @pytest.mark.parametrize(
     ("scale", "twist"),
     [
@@ -168,21 +154,6 @@ def test_wheels_that_slip_in_each_of_many_short_pushes_do_not_stop_the_robot():
         scene.run(0.45)
         scene.wish = push
         assert scene.run(0.35).cause is None
-
-
-def test_contradictions_of_two_pushes_do_not_add_up_though_no_scan_came_in_between():
-    scene = started()
-    scene.held = True
-    while scene.state.scan_motion.held_since_ns is None:
-        scene.run(TICK_S)
-    first_ns = scene.state.scan_motion.held_since_ns
-    assert scene.moves
-    push = scene.state.push
-    another = replace(push, since_s=scene.now - 0.01)
-    scene.state = replace(scene.state, push=another)
-    while scene.state.scans.stamps_ns[-1] == first_ns:
-        scene.run(TICK_S)
-    assert scene.state.scan_motion.held_since_ns > first_ns
 
 
 @pytest.mark.parametrize(
@@ -243,11 +214,9 @@ def test_scans_that_are_older_than_their_stamps_do_not_stop_a_robot_that_starts_
         assert scene.decision.cause is None
 
 
-RAMPS = [(0.8, 0.0, 0.0), (0.6, 0.0, -0.6), (0.0, 0.0, 1.2)]
-
-
-@pytest.mark.parametrize("ramp_s", [0.4, 1.6])
-@pytest.mark.parametrize("twist", RAMPS)
+@pytest.mark.parametrize(
+    ("ramp_s", "twist"), [(0.4, (0.8, 0.0, 0.0)), (1.6, (0.6, 0.0, -0.6))]
+)
 def test_scans_that_are_older_than_their_stamps_do_not_stop_a_robot_that_gains_speed(
     ramp_s, twist
 ):
@@ -276,7 +245,7 @@ def test_a_body_that_is_held_while_its_robot_gains_speed_is_stopped_within_a_sec
     assert scene.now - began <= 1.0
 
 
-@pytest.mark.parametrize("beams", [1, 2, 3, 24])
+@pytest.mark.parametrize("beams", [1, 2, 24])
 def test_a_lidar_of_very_few_beams_decides_nothing_and_breaks_nothing(beams):
     lidar = LidarSpec(
         beams=beams,

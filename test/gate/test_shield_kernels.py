@@ -70,7 +70,7 @@ def nearest(outline, point, twist, blind):
 def test_the_sweep_is_that_of_a_fine_one_by_exact_distances(make, speed):
     rng = np.random.default_rng(3)
     told = []
-    for _ in range(200):
+    for _ in range(120):
         outline = make(rng)
         twist = rng.uniform(-1.0, 1.0, 3) * rng.choice(
             [(1, 0, 2), (1, 1, 2), (0, 0, 2), (1, 0, 0)]
@@ -85,7 +85,7 @@ def test_the_sweep_is_that_of_a_fine_one_by_exact_distances(make, speed):
         found = is_free(point[None], twist[None], body(outline), blind, BRAKE, STEP)
         assert found == (least > 0.0 or leaves), (outline, point, twist, blind)
         told.append(found)
-    assert 10 < sum(told) < len(told) - 10
+    assert 5 < sum(told) < len(told) - 5
 
 
 @pytest.mark.parametrize(
@@ -121,11 +121,11 @@ def test_who_catches_up_from_behind_finds_the_robot_at_rest(away, may):
         assert found == (may or speed == 0.0)
 
 
-def test_a_speed_next_to_nothing_is_swept():
-    twist = np.array([[1e-300, 0.0, 0.0]])
+@pytest.mark.parametrize("speed", [1e-300, 0.0])
+def test_a_speed_next_to_nothing_is_swept(speed):
+    twist = np.array([[speed, 0.0, 0.0]])
     ahead = np.array([[0.29, 0.0, 0.0], [9.0, 0.0, 1e-9]])
     assert is_free(ahead, twist, body(LONG), 0.5, BRAKE, STEP)
-    assert is_free(ahead, 0.0 * twist, body(LONG), 0.5, BRAKE, STEP)
 
 
 @pytest.mark.parametrize("unknown", [(), (19,), (20,), (21,), (19, 21)])

@@ -1,84 +1,24 @@
-"""A skid-steer whose turn ends apart from its speed, among pillars behind gate and shield."""
+"""The shield of a skid-steer whose turn ends apart from its speed."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from skid_rover import kinematics, limits_in, pillars, rover_model
+from skid_rover import kinematics, limits_in, rover_model
 
-from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.gate.footprint import get_body
-from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.gate.shield import STEP, list_stops
 from nics_drl_bridge.gate.shield_kernels import compute_clearance, is_free
 from nics_drl_bridge.gate.stopping import shield_config
-from nics_drl_bridge.interface import Start
 from nics_drl_bridge.robot.braking import derive_slowest_model
 
-ARRIVED_M = 0.3
 HELD_S = 0.4
 
 
 @pytest.fixture(scope="module")
 def model():
     return rover_model()
-
-
-class Drive:
-    """The robot behind its gate, and what was told of each period."""
-
-    def __init__(self, model, folder, start):
-        self.bare = SimBackend(model, pillars(), estimator=True)
-        self.gated = GatedBackend(self.bare, model, limits_in(folder))
-        self.gated.reset(Start(3, np.array(start)))
-        self.told = []
-
-    @property
-    def pose(self):
-        return self.bare.simulator.data.pose[0, 0].copy()
-
-    def command(self, forward, turn, periods=1):
-        for _ in range(periods):
-            self.told.append(self.gated.step(np.array([forward, turn]))[1])
-        return self
-
-    @property
-    def touched(self):
-        return any(each["true_collision"] for each in self.told)
-
-
-def bearing(pose, goal):
-    """Angle from the heading to a goal [rad]."""
-    away = np.arctan2(goal[1] - pose[1], goal[0] - pose[0]) - pose[2]
-    return float(np.angle(np.exp(1j * away)))
-
-
-@pytest.mark.parametrize(
-    ("start", "goal", "weaves"),
-    [
-        ((0.0, 0.0, 0.0), (3.0, 0.0), 0.9),
-        ((0.0, 0.0, 0.0), (0.3, 2.98), 0.0),
-        ((0.0, 0.0, 1.57), (2.4, 2.6), 0.9),
-        ((-3.0, 0.0, 0.0), (0.0, -0.4), 0.0),
-    ],
-)
-def test_it_reaches_a_goal_three_metres_away_and_does_not_creep(
-    model, tmp_path, start, goal, weaves
-):
-    drive = Drive(model, tmp_path, start)
-    for k in range(80):
-        pose = drive.pose
-        if np.hypot(*(goal - pose[:2])) < ARRIVED_M:
-            break
-        aim = bearing(pose, goal)
-        turn = 2.0 * aim + weaves * np.sin(np.pi * k * model.control_period)
-        drive.command(0.8 * max(0.0, np.cos(aim)), float(np.clip(turn, -1.2, 1.2)))
-    assert np.hypot(*(goal - drive.pose[:2])) < ARRIVED_M
-    assert not drive.touched
-    way = np.hypot(goal[0] - start[0], goal[1] - start[1]) - ARRIVED_M
-    time_s = len(drive.told) * model.control_period
-    assert way / time_s > 0.45
 
 
 @pytest.fixture(scope="module")
@@ -102,18 +42,7 @@ def stopping_poses(plant, command, latency_s):
     return np.array(poses)
 
 
-COMMANDS = [
-    (0.8, 1.2),
-    (0.8, 0.5),
-    (0.4, -1.2),
-    (-0.4, 1.0),
-    (0.15, 1.2),
-    (0.0, 1.2),
-    (0.8, 0.0),
-]
-
-
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", [(0.8, 1.2), (-0.4, 1.0), (0.15, -1.2), (0.0, 1.2)])
 @pytest.mark.parametrize("responds", ["as its model", "as slowly as its errors allow"])
 @pytest.mark.slow
 def test_a_point_that_the_shield_takes_for_free_is_never_touched_by_a_stop(
@@ -130,7 +59,7 @@ def test_a_point_that_the_shield_takes_for_free_is_never_touched_by_a_stop(
     body = get_body(shield)
     stops = list_stops(shield, HELD_S + shield.latency_s, 1.0, 1.0)
     count = 0
-    for x, y in np.random.default_rng(0).uniform(-1.5, 1.5, (1500, 2)):
+    for x, y in np.random.default_rng(0).uniform(-1.5, 1.5, (700, 2)):
         if compute_clearance(x, y, body) < shield.margin:
             continue
         point = np.array([[x, y, 0.0]])
@@ -145,4 +74,4 @@ def test_a_point_that_the_shield_takes_for_free_is_never_touched_by_a_stop(
         assert (
             min(compute_clearance(*each, body) for each in seen) > 0.5 * shield.margin
         )
-    assert count > 100
+    assert count > 50

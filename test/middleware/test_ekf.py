@@ -38,6 +38,13 @@ def numerical_jacobian(function, x, step=1e-6):
     return np.stack(columns, axis=1)
 
 
+def correct(estimator, kind, value, std=None):
+    """Corrects by a value with deviations, by default those of the model."""
+    noise = None if std is None else np.diag(np.atleast_1d(std) ** 2.0)
+    measured = np.atleast_1d(value).astype(float)
+    return estimator.correct(Measurement(kind, measured, noise))
+
+
 def random_mean(model, rng):
     state = [rng.uniform(v.min, v.max) / 2.0 for v in model.robot.state]
     return np.array([*rng.normal(size=2), rng.uniform(-2.5, 2.5), *state])
@@ -47,8 +54,10 @@ def random_command(model, rng):
     return rng.uniform(model.robot.command_low, model.robot.command_high)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-@pytest.mark.parametrize(("dt", "steps"), [(0.01, 1), (0.01, 10), (0.003, 1)])
+@pytest.mark.parametrize(
+    ("robot", "dt", "steps"),
+    [("ackermann", 0.003, 1), ("differential", 0.01, 10), ("mecanum", 0.01, 10)],
+)
 def test_the_transition_is_the_numerical_derivative_of_the_motion(robot, dt, steps):
     model = builtin_model(robot)
     rng = np.random.default_rng(1)
@@ -94,7 +103,7 @@ def test_a_command_acts_one_latency_after_it_was_sent(latency):
 
 
 def simulated_drive(model, seconds, seed, pose_std=None, noise=1.0):
-    """Errors (T, 3) of the estimate, of the odometry, and covariances, all in the robot's frame."""
+    """Errors (T, 3) of the estimate and their covariances, in the robot's frame."""
     simulator = FastSimulator(model, field(60.0))
     estimator = Estimator(model)
     rng = np.random.default_rng(seed)
@@ -102,7 +111,6 @@ def simulated_drive(model, seconds, seed, pose_std=None, noise=1.0):
     simulator.reset([seed], starts=start[None, None])
     estimator.reset(0, start)
     errors = []
-    drifts = []
     covariances = []
     command = random_command(model, rng)
     for step in range(seconds * 10):
@@ -112,27 +120,22 @@ def simulated_drive(model, seconds, seed, pose_std=None, noise=1.0):
         simulator.step(command[None, None])
         now = (step + 1) * PERIOD
         estimator.predict(now)
-        estimator.update(Kind.TWIST, simulator.data.twist[0, 0])
+        correct(estimator, Kind.TWIST, simulator.data.twist[0, 0])
         true = simulator.data.pose[0, 0]
         if pose_std is not None and step % 10 == 9:
             measured = true + rng.normal(size=3) * noise * pose_std
-            estimator.update(Kind.POSE, measured, np.full(3, pose_std))
+            correct(estimator, Kind.POSE, measured, np.full(3, pose_std))
         errors.append(geometry.between(true, estimator.look_ahead(now)[0]))
-        drifts.append(geometry.between(true, simulator.data.odom[0, 0]))
         turn = np.eye(3)
         turn[:2, :2] = geometry.rotate(np.eye(2), true[2]).T
         covariances.append(turn.T @ estimator.covariance[:3, :3] @ turn)
-    return np.array(errors), np.array(drifts), np.array(covariances)
+    return np.array(errors), np.array(covariances)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("robot", "noise"), [("ackermann", 1.0), ("mecanum", 4.0)])
-def test_with_measured_poses_the_estimate_stays_at_the_truth(robot, noise):
-    """Even if the noise is four times as large as it was told."""
+def test_poses_with_four_times_the_noise_that_was_told_keep_the_estimate_at_the_truth():
     std = 0.02
-    model = builtin_model(robot)
-    errors, _, covariances = simulated_drive(model, 30, 1, std, noise)
-    assert np.abs(errors[100:]).max() < 0.1 * noise
+    errors, covariances = simulated_drive(builtin_model("mecanum"), 20, 1, std, 4.0)
+    assert np.abs(errors[100:]).max() < 0.4
     assert np.sqrt((errors[100:, :2] ** 2).mean()) < 2.0 * std
     assert np.linalg.eigvalsh(covariances).min() > 0.0
 
@@ -147,30 +150,31 @@ def test_a_wrong_or_unknown_start_is_mended_by_measured_poses(std, truth, second
     estimator.reset(0, np.zeros(3), std)
     for second in range(1, seconds + 1):
         estimator.predict(second * SECOND)
-        estimator.update(Kind.POSE, truth, [0.01] * 3)
+        correct(estimator, Kind.POSE, truth, [0.01] * 3)
     found = estimator.look_ahead(estimator.time_ns)[0]
     assert geometry.between(np.array(truth), found) == pytest.approx(0.0, abs=0.01)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("robot", ["mecanum"])
-def test_the_covariance_stays_positive_definite_over_thousands_of_random_steps(robot):
-    model = builtin_model(robot)
+def test_the_covariance_stays_positive_definite_over_a_thousand_random_steps():
+    model = builtin_model("mecanum")
     rng = np.random.default_rng(3)
     estimator = Estimator(model)
     now = 0
     estimator.reset(now, np.zeros(3))
-    for step in range(3_000):
+    for step in range(1_000):
         now += int(rng.integers(1, PERIOD))
         kind = step % 4 if step % 7 else 4
         if kind < 2:
             estimator.add_command(now, random_command(model, rng))
         estimator.predict(now)
         if kind in (1, 2):
-            estimator.update(Kind.TWIST, rng.normal(size=3))
+            correct(estimator, Kind.TWIST, rng.normal(size=3))
         elif kind == 3:
-            estimator.update(
-                Kind.POSE, rng.normal(size=3), 10.0 ** rng.uniform(-4.0, 1.0, 3)
+            correct(
+                estimator,
+                Kind.POSE,
+                rng.normal(size=3),
+                10.0 ** rng.uniform(-4.0, 1.0, 3),
             )
         if step % 100 == 99:
             covariance = estimator.covariance
@@ -222,7 +226,7 @@ def test_the_estimate_is_as_uncertain_as_it_claims(robot, pose_std):
     model = noisy_model(robot)
     nees = []
     for seed in range(RUNS):
-        errors, _, covariances = simulated_drive(model, 8, seed, pose_std)
+        errors, covariances = simulated_drive(model, 8, seed, pose_std)
         nees.append(errors[-1] @ np.linalg.solve(covariances[-1], errors[-1]))
     low, high = chi2.ppf([0.025, 0.975], 3 * RUNS) / RUNS
     assert low < np.mean(nees) < high
@@ -294,7 +298,7 @@ def test_the_way_goes_on_from_a_pose_that_was_measured_in_between(heading):
     estimator.add_command(0, [1.0, 0.0, 0.0])
     there = np.array([1.5, 0.5, heading])
     estimator.predict(PERIOD // 2)
-    estimator.update(Kind.POSE, there, np.full(3, 1e-3))
+    correct(estimator, Kind.POSE, there, np.full(3, 1e-3))
     stepped(estimator, PERIOD, [1.0, 0.0, 0.0], [0.1, 0.0, 0.0])
     ahead = geometry.compose(there, np.array([0.05, 0.0, 0.0]))
     assert estimator.look_ahead(PERIOD)[0] == pytest.approx(ahead, abs=0.01)
@@ -320,7 +324,7 @@ def driven(robot="ackermann", seconds=2):
     estimator.add_command(0, command)
     for step in range(1, seconds * 10 + 1):
         estimator.predict(step * PERIOD)
-        verdict = estimator.update(Kind.TWIST, estimator.look_ahead(step * PERIOD)[1])
+        verdict = correct(estimator, Kind.TWIST, estimator.look_ahead(step * PERIOD)[1])
         assert verdict.outcome is Acceptance.USED
     return estimator
 
@@ -332,7 +336,7 @@ def assert_same_belief(estimator, before):
 
 def test_a_twist_that_is_slower_than_expected_is_news_at_once():
     estimator = driven()
-    assert estimator.update(Kind.TWIST, np.zeros(3)).outcome is Acceptance.NEWS
+    assert correct(estimator, Kind.TWIST, np.zeros(3)).outcome is Acceptance.NEWS
     assert estimator.belief.outliers == (0, 0, 0)
     assert abs(estimator.look_ahead(estimator.time_ns)[1][0]) < 0.01
 
@@ -343,16 +347,16 @@ def test_impossible_twists_are_believed_from_the_third_in_a_row_until_one_fits_a
     pose = estimator.look_ahead(estimator.time_ns)[0]
     outcomes = []
     for count in range(1, 6):
-        outcomes.append(estimator.update(Kind.TWIST, [0.5, 0.8, 0.0]).outcome)
+        outcomes.append(correct(estimator, Kind.TWIST, [0.5, 0.8, 0.0]).outcome)
         if count < 3:
             assert_same_belief(estimator, before)
             assert estimator.belief.outliers == (count, 0, 0)
     assert outcomes == [Acceptance.OUTLIER] * 2 + [Acceptance.JUMP] * 3
     assert np.array_equal(estimator.look_ahead(estimator.time_ns)[0], pose)
-    fitting = estimator.update(Kind.TWIST, [0.5, 0.0, 0.0]).outcome
+    fitting = correct(estimator, Kind.TWIST, [0.5, 0.0, 0.0]).outcome
     assert fitting is not Acceptance.OUTLIER
     assert estimator.belief.outliers == (0, 0, 0)
-    assert estimator.update(Kind.TWIST, [0.5, 0.8, 0.0]).outcome is Acceptance.OUTLIER
+    assert correct(estimator, Kind.TWIST, [0.5, 0.8, 0.0]).outcome is Acceptance.OUTLIER
 
 
 def test_a_pose_far_off_is_refused_and_the_fifth_in_a_row_is_taken_as_a_jump():
@@ -360,52 +364,54 @@ def test_a_pose_far_off_is_refused_and_the_fifth_in_a_row_is_taken_as_a_jump():
     far = [30.0, 2.0, -3.0]
     good = estimator.look_ahead(estimator.time_ns)[0]
     for _ in range(2):  # outliers are counted in a row only
-        assert estimator.update(Kind.POSE, good, [0.02] * 3).outcome is Acceptance.USED
+        assert (
+            correct(estimator, Kind.POSE, good, [0.02] * 3).outcome is Acceptance.USED
+        )
         before = estimator.belief
         for _ in range(4):
-            judged = estimator.update(Kind.POSE, far, [0.02] * 3)
+            judged = correct(estimator, Kind.POSE, far, [0.02] * 3)
             assert judged.outcome is Acceptance.OUTLIER
             assert_same_belief(estimator, before)
-    assert estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.JUMP
+    assert correct(estimator, Kind.POSE, far, [0.02] * 3).outcome is Acceptance.JUMP
     pose, twist = estimator.look_ahead(estimator.time_ns)
     assert pose == pytest.approx(far)
     assert twist[0] == pytest.approx(0.5, abs=0.1)  # it still drives
     assert np.sqrt(np.diag(estimator.covariance)[:3]) == pytest.approx(0.02)
     assert (estimator.covariance[:3, 3:] == 0.0).all()  # it says nothing of the state
     assert np.linalg.eigvalsh(estimator.covariance).min() > 0.0
-    assert estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.USED
+    assert correct(estimator, Kind.POSE, far, [0.02] * 3).outcome is Acceptance.USED
 
 
 def test_a_yaw_rate_moves_nothing_by_itself_and_is_refused_beyond_the_robots_reach():
     estimator = driven()
     before = estimator.belief
-    assert estimator.update(Kind.YAW_RATE, 0.03, 0.01).outcome is Acceptance.USED
-    assert estimator.update(Kind.YAW_RATE, 40.0).outcome is Acceptance.OUTLIER
+    assert correct(estimator, Kind.YAW_RATE, 0.03, 0.01).outcome is Acceptance.USED
+    assert correct(estimator, Kind.YAW_RATE, 40.0).outcome is Acceptance.OUTLIER
     assert_same_belief(estimator, before)
 
 
-@pytest.mark.parametrize("value", [1e9, 1e200, 1e308])
+@pytest.mark.parametrize("value", [1e9, 1e308])
 def test_what_is_beyond_all_bounds_is_never_believed_however_often_it_comes(value):
     estimator = driven()
     before = estimator.belief
-    for _ in range(20):
+    for _ in range(7):
         for kind, measured in (
             (Kind.TWIST, [value, 0.0, 0.0]),
             (Kind.POSE, [0.0, -value, 0.0]),
             (Kind.YAW_RATE, value),
         ):
-            assert estimator.update(kind, measured).outcome is Acceptance.OUTLIER
+            assert correct(estimator, kind, measured).outcome is Acceptance.OUTLIER
     assert_same_belief(estimator, before)
 
 
 @pytest.mark.parametrize(("robot", "value"), [("ackermann", 1e3), ("mecanum", -1e308)])
 def test_absurd_commands_leave_the_filter_sound(robot, value):
     estimator = driven(robot)
-    for k in range(1, 20):
+    for k in range(1, 8):
         now = estimator.time_ns
         estimator.add_command(now, np.full(len(estimator._log.commands[0]), value))
         estimator.predict(now + k * PERIOD)
-        estimator.update(Kind.TWIST, np.zeros(3))
+        correct(estimator, Kind.TWIST, np.zeros(3))
         for ahead_s in (9, 90):
             found = np.concatenate(estimator.look_ahead(now + ahead_s * SECOND))
             assert np.isfinite(found).all()
@@ -416,27 +422,26 @@ def test_absurd_commands_leave_the_filter_sound(robot, value):
 def test_a_heading_beyond_the_seam_is_near_and_no_outlier(believed, measured):
     estimator = Estimator(builtin_model("differential"))
     estimator.reset(0, [0.0, 0.0, believed], 0.02)
-    verdict = estimator.update(Kind.POSE, [0.0, 0.0, measured], [0.02] * 3)
+    verdict = correct(estimator, Kind.POSE, [0.0, 0.0, measured], [0.02] * 3)
     assert verdict.outcome is Acceptance.USED
     assert verdict.nis == pytest.approx((2.0 * np.pi - 6.27) ** 2 / (2 * 0.02**2))
     assert abs(estimator.look_ahead(0)[0][2]) > 3.13
 
 
-@pytest.mark.slow
-def test_a_gate_refuses_one_good_measurement_in_a_thousand():
+@pytest.mark.parametrize(
+    ("fraction", "outcome"), [(0.9989, Acceptance.USED), (0.9991, Acceptance.OUTLIER)]
+)
+def test_a_gate_refuses_one_good_measurement_in_a_thousand(fraction, outcome):
     estimator = driven()
-    rng = np.random.default_rng(0)
-    refused = 0
-    belief = estimator.belief
-    spread = np.linalg.cholesky(belief.covariance[:3, :3] + np.eye(3) * 0.05**2)
-    for _ in range(20_000):
-        estimator.belief = belief
-        measured = belief.mean[:3] + spread @ rng.normal(size=3)
-        refused += (
-            estimator.update(Kind.POSE, measured, [0.05] * 3).outcome
-            is Acceptance.OUTLIER
-        )
-    assert 8 <= refused <= 36  # 20 are expected; 99.9 % of such counts
+    covariance = estimator.belief.covariance[:3, :3] + np.eye(3) * 0.05**2
+    away = np.linalg.cholesky(covariance) @ np.full(
+        3, np.sqrt(chi2.ppf(fraction, 3) / 3)
+    )
+    verdict = correct(
+        estimator, Kind.POSE, estimator.belief.mean[:3] + away, [0.05] * 3
+    )
+    assert verdict.nis == pytest.approx(chi2.ppf(fraction, 3))
+    assert verdict.outcome is outcome
 
 
 def test_a_covariance_that_rounding_made_indefinite_is_mended():

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.kernels import CommandLog, make_log
@@ -29,14 +28,6 @@ def test_the_order_of_adding_does_not_matter():
     for now in rng.integers(0, 10_000, 100):
         earlier = times[times < now]
         assert in_effect(log, now) == [float(earlier.max()) if len(earlier) else 0.0]
-
-
-@pytest.mark.parametrize("time", [10, 20, 30])
-def test_of_two_commands_at_once_the_first_stays(time):
-    log = make_log([0.0])
-    for other in (10, 20, 30):
-        log = logged(log, other, [1.0], 0)
-    assert not len(logged(log, time, [2.0], 0).effective)
 
 
 def test_what_is_no_longer_needed_is_forgotten_and_all_else_kept():

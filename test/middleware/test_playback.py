@@ -17,7 +17,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware.playback import estimate, write_estimate
 
-DURATION_S = 6.0
+DURATION_S = 4.0
 MODEL = builtin_model("ackermann")
 STEP = 0.05
 

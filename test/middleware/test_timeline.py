@@ -97,9 +97,8 @@ def numbers(middleware):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", ["ackermann", "mecanum"])
-def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(robot):
-    model = builtin_model(robot)
+def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order():
+    model = builtin_model("mecanum")
     rng = np.random.default_rng(0)
     drive = messages(model, rng)
     late = sorted(drive, key=lambda m: m.stamp_ns + m.underway_ns)
@@ -119,11 +118,9 @@ def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(robo
     assert other.replayed > 100
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-def test_any_order_of_one_seconds_data_gives_the_same_estimate(seed):
+def test_any_order_of_one_seconds_data_gives_the_same_estimate():
     model = builtin_model("ackermann")
-    rng = np.random.default_rng(100 + seed)
+    rng = np.random.default_rng(100)
     drive = messages(model, rng, seconds=0.9)
     _, expected = numbers(fed(model, drive))
     shuffled = [drive[k] for k in rng.permutation(len(drive))]
@@ -189,7 +186,7 @@ def test_what_is_too_late_is_refused_with_the_reason(timeline, kind, stamp, reas
         assert timeline.command(stamp, [0.2, 0.0]) == DUPLICATE
 
 
-@pytest.mark.parametrize("offset", [-(10**18), 0, 10**18])
+@pytest.mark.parametrize("offset", [-(10**18), 10**18])
 @pytest.mark.parametrize(
     ("period_s", "passed_s", "ahead_s"), [(0, 0, 1), (0, 60, 61), (3, 1, 7), (0, -7, 1)]
 )

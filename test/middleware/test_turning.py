@@ -57,11 +57,9 @@ def slipping():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"commands": 1.0 / OVER_REPORTED},
-        {"variance": 0.004**2},
+        {"commands": 1.0 / OVER_REPORTED, "variance": 0.004**2},
         {"variance": 1e-12, "turn_variance": 1e3},
-        {"variance": 1e6, "turn_variance": 1e-9},
-        {"every": 10},
+        {"variance": 1e6, "turn_variance": 1e-9, "every": 10},
     ],
 )
 def test_after_two_minutes_the_belief_is_close_to_the_truth(slipping, changes):
@@ -89,15 +87,6 @@ def test_without_the_gyro_the_same_drive_ends_far_from_the_truth(slipping):
     assert middleware.estimator.belief.gyro is None
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("noise", [0.0, 0.03])
-def test_neither_an_exact_nor_a_noisy_gyro_makes_odometry_an_outlier(noise):
-    drive = drive_skid_steer(np.random.default_rng(3), duration=60.0, noise=noise)
-    middleware, poses, truths = believed(drive)
-    assert off(poses, truths)[1] < 0.1
-    assert middleware.health(0).rejected.get(("odom", "outlier"), 0) < 5
-
-
 def test_an_exact_gyro_that_turns_steadily_is_not_taken_for_stuck():
     middleware = Middleware(builtin_model("differential"))
     middleware.reset(0, np.zeros(3))
@@ -112,39 +101,43 @@ def test_an_exact_gyro_that_turns_steadily_is_not_taken_for_stuck():
     assert middleware.view(6 * NS).pose[2] == pytest.approx(heading / 1.5, abs=0.08)
 
 
-FAULTS = {
-    "frozen": lambda drive: np.full_like(drive.gyro, 0.0),
-    "in degrees": lambda drive: np.degrees(drive.gyro),
-    "mirrored": lambda drive: -drive.gyro,
-    "mad": lambda drive: np.where(np.arange(len(drive.gyro)) % 2, 9.0, -9.0),
-}
+TRUE_WHEELS = {"over_reported": 1.0}
+UNBIASED = {"over_reported": 1.0, "bias": 0.0}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_gyro_that_is_faulty_leaves_the_heading_to_the_wheels(fault):
-    drive = drive_skid_steer(
-        np.random.default_rng(4), duration=60.0, over_reported=1.0, bias=0.0
-    )
-    _, poses, truths = believed(drive, gyro=FAULTS[fault](drive))
-    _, turned = off(poses, truths)
-    assert turned < 0.25
+def spoil(rates):
+    """Every 37th rate is far off."""
+    spoilt = rates.copy()
+    spoilt[100::37] += 2.5
+    return spoilt
 
 
-def test_single_far_off_rates_are_refused():
-    drive = drive_skid_steer(np.random.default_rng(4), duration=20.0)
-    rates = drive.gyro.copy()
-    rates[100::37] += 2.5
-    middleware, poses, truths = believed(drive, gyro=rates)
-    assert middleware.health(0).rejected[("imu", "outlier")] >= 40
-    assert off(poses, truths)[1] < 0.1
-
-
-def test_a_gyro_that_falls_silent_leaves_the_turns_to_the_wheels():
-    drive = drive_skid_steer(np.random.default_rng(4), duration=30.0, over_reported=1.0)
-    middleware, poses, truths = believed(drive, gyro=drive.gyro[:1500])
-    assert off(poses, truths)[1] < 0.15
-    assert middleware.estimator.belief.gyro.stamp_ns < 16 * NS
+@pytest.mark.parametrize(
+    ("seconds", "changes", "gyro", "turned", "outliers"),
+    [
+        (30.0, {"noise": 0.0}, lambda rates: rates, 0.1, {"odom": (0, 5)}),
+        (30.0, {"noise": 0.03}, lambda rates: rates, 0.1, {"odom": (0, 5)}),
+        (20.0, {}, spoil, 0.1, {"imu": (40, 60)}),
+        (30.0, TRUE_WHEELS, lambda rates: rates[:1500], 0.15, {}),
+        (40.0, UNBIASED, np.zeros_like, 0.25, {}),
+        (40.0, UNBIASED, np.degrees, 0.25, {}),
+        (40.0, UNBIASED, np.negative, 0.25, {}),
+        (40.0, UNBIASED, lambda rates: 9.0 * (-1.0) ** np.arange(len(rates)), 0.25, {}),
+    ],
+    ids=[
+        *("exact", "noisy", "single rates far off", "falls silent"),
+        *("frozen", "in degrees", "mirrored", "mad"),
+    ],
+)
+def test_whatever_the_gyro_does_the_heading_is_true_and_odometry_no_outlier(
+    seconds, changes, gyro, turned, outliers
+):
+    drive = drive_skid_steer(np.random.default_rng(4), duration=seconds, **changes)
+    middleware, poses, truths = believed(drive, gyro=gyro(drive.gyro))
+    assert off(poses, truths)[1] < turned
+    rejected = middleware.health(0).rejected
+    for topic, (least, most) in outliers.items():
+        assert least <= rejected.get((topic, "outlier"), 0) < most
 
 
 def test_wheels_that_stand_do_not_turn_the_robot_however_the_gyro_drifts():

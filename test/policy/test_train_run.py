@@ -96,7 +96,7 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
     ("arguments", "sentence"),
     [
         (["--robot", "diferential"], "did you mean 'differential'"),
-        (["--resume"], "--resume needs --out"),
+        (["--resume"], "--resume requires --out"),
         (["--resume", "--out", "nowhere"], "nowhere: contains no settings.yaml"),
         (["--seeds", "1", "1", "--out", "run"], "give one or more, without duplicates"),
         (["--engine", "rai"], "unknown engine 'rai'; did you mean 'ray'"),
@@ -260,7 +260,9 @@ def test_an_interrupted_training_tells_the_command_that_resumes_it(tmp_path):
         said = process.communicate(timeout=60.0)[1]
     assert process.returncode == 130, said
     line = next(
-        each for each in said.splitlines() if each.startswith("to go on from the last")
+        each
+        for each in said.splitlines()
+        if each.startswith("to continue from the last")
     )
     command = line.partition("checkpoint: ")[2]
     expected = (

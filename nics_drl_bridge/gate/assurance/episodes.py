@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nics_drl_bridge.gate.assurance.gate_loop import Gate, Witness
 from nics_drl_bridge.gate.assurance.place import Job, Outcome, Place
+from nics_drl_bridge.gate.gate_loop import Gate, Witness
 from nics_drl_bridge.gate.inputs import Command, Input, Odometry, Scan
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.gate.state import Decision, GateConfig, replace

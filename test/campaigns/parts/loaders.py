@@ -33,7 +33,7 @@ from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.extras.bags.info import read_bag_info
 from nics_drl_bridge.files import SUMS, hash_bytes, seal, write_bytes, write_sums
 from nics_drl_bridge.gate import black_box
-from nics_drl_bridge.gate.assurance.gate_loop import Gate
+from nics_drl_bridge.gate.gate_loop import Gate
 from nics_drl_bridge.gate.inputs import Tick
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import MODEL_FILE, builtin_model, load_model, save_model

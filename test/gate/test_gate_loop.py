@@ -5,7 +5,7 @@ import pytest
 
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.gate.assurance.episodes import configure_gate
-from nics_drl_bridge.gate.assurance.gate_loop import Gate
+from nics_drl_bridge.gate.gate_loop import Gate
 from nics_drl_bridge.generator import builtin_model
 
 
