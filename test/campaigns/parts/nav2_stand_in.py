@@ -122,7 +122,7 @@ class StandIn(SpunNode):
                     self.plan(goal, radius), controller_id=self._controller
                 )
 
-    def touched(self) -> bool:
+    def has_touched(self) -> bool:
         """True if the robot has touched something."""
         return not any(self.call(SelfTest, "simulator_node/self_test").passed)
 
