@@ -177,7 +177,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         "--seconds 4",
         {
             "busy": Control(
-                "haste: the gate reads each message and decides ten times",
+                "haste: the gate decides ten times on each message",
                 "the gate's share of a core",
             ),
         },

@@ -24,7 +24,7 @@ from campaign import (
     tell,
 )
 from fidelity import average_drives
-from transfer import ENGINES, FAST, find_engines, make_simulator
+from transfer import PHYSICS_ENGINES, find_engines, make_simulator
 
 from nics_drl_bridge.extras.physics.simulator import PhysicsSimulator
 from nics_drl_bridge.generator import builtin_model
@@ -33,7 +33,6 @@ from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.sim.world import load_world
 
-PHYSICS_ENGINES = tuple(engine for engine in ENGINES if engine != FAST)
 ROBOTS = ("ackermann", "differential", "jackal", "mecanum")
 GYRO = {"gyro_bias": 0.001, "gyro_noise": 0.01}  # [rad/s]
 WIDE = load_world("empty").model_copy(update={"size": (400.0, 400.0)})
@@ -120,7 +119,7 @@ def judge(result: Result) -> list[str]:
 
 
 OPTIONS = {
-    "engines": some_of(PHYSICS_ENGINES),
+    "engines": some_of(tuple(PHYSICS_ENGINES)),
     "robots": some_of(ROBOTS),
     "train": (120.0, "recorded seconds"),
     "unseen": (30.0, "seconds of each unseen drive"),

@@ -36,6 +36,7 @@ STEPS_PER_EPISODE = 20
 SAMPLE_S = 5.0
 PATIENCE_S = 90.0
 GOAL_AGAIN_S = 1.0
+FIRST_GOAL_S = 15.0
 STOPPED = "stopped, "  # stands before a rule in the gate's diagnostics
 BARS = {
     "unexplained_stops": at_most(0),
@@ -84,15 +85,12 @@ class Drive(SpunNode):
                 self.stops[value.key.removeprefix(STOPPED)] = int(value.value)
 
     def arm(self) -> None:
-        """Asks the gate until it grants and a goal is reached."""
-
-        def is_armed() -> bool:
-            self.until(lambda: False, 1.0)
-            answer = self.call_service(Trigger, "command_gate/arm", PATIENCE_S)
-            return bool(answer.success)
-
-        self.until(is_armed, PATIENCE_S)
-        self.until(lambda: self.goals, PATIENCE_S)
+        """Arms the gate, again and again until a goal is reached."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not self.goals and time.monotonic() < deadline_s:
+            for service in ("reset", "arm"):
+                self.call_service(Trigger, f"command_gate/{service}", PATIENCE_S)
+            self.until(lambda: self.goals, FIRST_GOAL_S)
 
     def go_on(self) -> None:
         """Handles what has come."""

@@ -13,11 +13,11 @@ import pytest
 
 pytest.importorskip("pybullet", reason="needs PyBullet: pip install pybullet==3.2.7")
 
+from extras.physics import test_simulators as shared
 from extras.physics.driving import drive
 from extras.physics.engines import Engine
 from extras.physics.test_simulators import (  # noqa: F401
     test_a_footprint_of_corners_touches_by_its_corners,
-    test_a_robot_that_does_not_slip_moves_nearly_as_the_model_says,
     test_a_robot_that_drives_into_a_wall_stops_there_and_has_collided,
     test_a_wrong_command_is_refused,
     test_an_episode_is_the_same_bits_whatever_was_before,
@@ -54,6 +54,11 @@ def engine(monkeypatch) -> Engine:
         slip_error=0.07,
         wall_error=0.015,
     )
+
+
+@pytest.mark.parametrize("name", ["ackermann", "differential", "mecanum"])
+def test_a_robot_that_does_not_slip_moves_nearly_as_the_model_says(engine, name):
+    shared.test_a_robot_that_does_not_slip_moves_nearly_as_the_model_says(engine, name)
 
 
 @pytest.mark.parametrize("world", [load_world("crowd"), load_world("room")], ids=str)

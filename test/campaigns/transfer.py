@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
@@ -35,13 +35,17 @@ from campaign import (
 )
 from measuring.evaluations import Standing
 from measuring.perturbations import open_real_model
+from parts.pybullet_simulator import PHYSICS as PYBULLET_PHYSICS
+from parts.pybullet_simulator import PybulletSimulator, load_pybullet
 
 from nics_drl_bridge.commands.episodes import Conditions, make_env
 from nics_drl_bridge.confidence import compare_pairs, estimate_rate
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.dart.scenery import load_dart
 from nics_drl_bridge.extras.dart.simulator import PHYSICS as DART_PHYSICS
 from nics_drl_bridge.extras.dart.simulator import DartSimulator
+from nics_drl_bridge.extras.mujoco.machines import load_mujoco
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.extras.physics.machines import Physics
 from nics_drl_bridge.gate.assurance.results import cluster_seeds
@@ -54,7 +58,13 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 FAST = "fast"
-ENGINES = (FAST, "mujoco", "dart", "pybullet")
+# by name: the simulator, its usual physics, and what says what to install
+PHYSICS_ENGINES: dict[str, tuple[Any, Physics, Callable[[], Any]]] = {
+    "mujoco": (MujocoSimulator, Physics(), load_mujoco),
+    "dart": (DartSimulator, DART_PHYSICS, load_dart),
+    "pybullet": (PybulletSimulator, PYBULLET_PHYSICS, load_pybullet),
+}
+ENGINES = (FAST, *PHYSICS_ENGINES)
 WORLDS = (
     "arena",
     "circles",
@@ -99,28 +109,16 @@ def make_simulator(
 
     Raises ConfigError if the engine is not installed.
     """
-    if engine == "mujoco":
-        changed = replace(Physics(), **physics)
-        return MujocoSimulator(model, world, physics=changed, randomisation=drawn)
-    if engine == "dart":
-        changed = replace(DART_PHYSICS, **physics)
-        return DartSimulator(model, world, physics=changed, randomisation=drawn)
-    from parts.pybullet_simulator import PHYSICS, PybulletSimulator
-
-    return PybulletSimulator(model, world, replace(PHYSICS, **physics), drawn)
+    make, usual, _ = PHYSICS_ENGINES[engine]
+    changed = replace(usual, **physics)
+    return make(model, world, physics=changed, randomisation=drawn)
 
 
 def find_missing(engine: str) -> str:
     """Returns why an engine can't be driven here; nothing if it can."""
-    from parts.pybullet_simulator import load_pybullet
-
-    from nics_drl_bridge.extras.dart.scenery import load_dart
-    from nics_drl_bridge.extras.mujoco.machines import load_mujoco
-
-    load = {"mujoco": load_mujoco, "dart": load_dart, "pybullet": load_pybullet}
     try:
         if engine != FAST:
-            load[engine]()
+            PHYSICS_ENGINES[engine][-1]()
     except ConfigError as error:
         return str(error)
     return ""

@@ -8,11 +8,12 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import bags
 import numpy as np
 import onnx
 
@@ -239,69 +240,33 @@ WRITTEN = (
 # Bags, by this package and by others, and CSV folders: what was recorded elsewhere.
 
 
-def _write_bag(storage: str) -> Callable[[Path, int], None]:
-    return lambda path, version: write_bag(
-        _drive(version), path, load_robot(ROBOT), storage
-    )
-
-
-def _write_foreign(compression: str) -> Callable[[Path, int], None]:
-    """Writes a bag by rosbags alone, without checksums."""
-
-    def write(path: Path, version: int) -> None:
-        from rosbags.rosbag2 import (
-            CompressionFormat,
-            CompressionMode,
-            Reader,
-            StoragePlugin,
-            Writer,
-        )
-
-        writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
-        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
-        with tempfile.TemporaryDirectory() as folder:
-            ours = Path(folder) / "bag"
-            _write_bag("mcap")(ours, version)
-            with Reader(ours) as reader, writer:
-                connections = {
-                    c.id: writer.add_connection(
-                        c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest
-                    )
-                    for c in reader.connections
-                }
-                for connection, ns, data in reader.messages():
-                    writer.write(connections[connection.id], ns, data)
-
-    return write
-
-
-def _read_bag(with_content: bool) -> Callable[[Path], object]:
-    """Reads a bag in every way that there is; returns what was read in each."""
+def _make_bag(
+    name: str, write: Callable[[Path, int], object], is_checked: bool = False
+) -> Loader:
+    """Returns the loader of a bag, which is read in every way that there is."""
 
     def read(path: Path) -> object:
         held = {}
         with open_bag(path) as bag:
             for topic, kind in bag.types.items():
-                rows = bag.read_serialized(topic)
-                content = [_hash(np.frombuffer(data, np.uint8)) for _, data in rows]
-                times = [ns for ns, _ in rows]
-                held[topic] = (kind, times, content if with_content else [])
+                rows = [(ns, bytes(data)) for ns, data in bag.read_serialized(topic)]
+                held[topic] = kind, rows if is_checked else [ns for ns, _ in rows]
         counts = {topic.topic: topic.count for topic in read_bag_info(path).topics}
         streams: Any = read_recording(path, load_robot(ROBOT)).streams
         return held, counts, len(streams["command"].t)
 
-    return read
-
-
-def _make_bag(name: str, write: Callable[[Path, int], None], checked: bool) -> Loader:
+    command = ("bag", "info")
     return Loader(
-        name,
-        write,
-        _read_bag(checked),
-        sealed=False,
-        text="metadata.yaml",
-        command=("bag", "info"),
+        name, write, read, sealed=False, text="metadata.yaml", command=command
     )
+
+
+def _write_own(storage: str, path: Path, version: int) -> None:
+    write_bag(_drive(version), path, load_robot(ROBOT), storage)
+
+
+def _write_foreign(compression: str, path: Path, version: int) -> None:
+    bags.write(path, bags.drive(), "mcap", compression)  # without checksums
 
 
 def _write_csv(path: Path, version: int) -> None:
@@ -313,10 +278,10 @@ def _write_csv(path: Path, version: int) -> None:
 
 
 RECORDED = (
-    _make_bag("ours_mcap", _write_bag("mcap"), checked=True),
-    _make_bag("ours_sqlite3", _write_bag("sqlite3"), checked=False),
-    _make_bag("foreign_mcap", _write_foreign("NONE"), checked=False),
-    _make_bag("foreign_packed", _write_foreign("STORAGE"), checked=False),
+    _make_bag("ours_mcap", partial(_write_own, "mcap"), is_checked=True),
+    _make_bag("ours_sqlite3", partial(_write_own, "sqlite3")),
+    _make_bag("foreign_mcap", partial(_write_foreign, "none")),
+    _make_bag("foreign_packed", partial(_write_foreign, "storage")),
     Loader(
         "csv",
         _write_csv,

@@ -7,7 +7,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from nav2_msgs.action import FollowPath
 from parts import nav2_names
 from parts.nav2_stand_in import StandIn
 from rcl_interfaces.srv import SetParametersAtomically
@@ -50,9 +49,9 @@ def follow_paths(folder: Path, episodes: int, is_bare: bool) -> list[str]:
         for name, parameters in nodes.items():
             process = NodeProcess(name, folder, parameters, domain_id)
             stack.enter_context(process)
-        tree = StandIn(domain_id, FollowPath, "Nobody" if is_bare else "FollowPath")
+        tree = StandIn(domain_id, "Nobody" if is_bare else "FollowPath")
         stack.callback(tree.close)
-        tree.wait_for(tree.client.server_is_ready, "the action follow_path", kick=True)
+        tree.wait_for(tree.client.server_is_ready, "the action follow_path")
         tree.wait_for(
             lambda: tree.poses.get_subscription_count() >= 2, "both ends of initialpose"
         )
@@ -80,7 +79,7 @@ def begin_episode(tree: StandIn, seed: int, cells: bytes) -> None:
     )
     tree.truths.clear()
     tree.call(Trigger, "simulator_node/reset")
-    tree.wait_for(lambda: tree.shows(cells), "map and truth", kick=True)
+    tree.wait_for(lambda: tree.shows(cells), "map and truth")
 
 
 def find_missing(folder: Path, file: Path, is_bare: bool) -> list[str]:
