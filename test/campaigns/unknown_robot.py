@@ -167,7 +167,7 @@ class Operator(SpunNode):
         self.commanded: list[tuple[float, bool]] = []  # time [s], whether it moves
         self._policy_moves = False  # since the last goal
         node = self.node
-        node.create_subscription(Odometry, "ground_truth", self._take_pose, 10)
+        node.create_subscription(Odometry, "true_pose", self._take_pose, 10)
         node.create_subscription(Bool, "touched", self._take_touch, 10)
         node.create_subscription(TwistStamped, "cmd_vel", self._take_command, 10)
         node.create_subscription(TwistStamped, "cmd_vel_raw", self._take_wish, 10)

@@ -6,7 +6,7 @@ driver's odometry believes, because the driver computes with one effective track
 the true turn rate, with noise and a constant bias.
 
 Subscribes to `cmd_vel` (TwistStamped), publishes `odom`, `scan`, `imu` and, for the judge alone,
-`ground_truth` and `touched`. `hold` (Bool) fixes the body to the ground while its wheels go on.
+`true_pose` and `touched`. `hold` (Bool) fixes the body to the ground while its wheels go on.
 """
 
 from __future__ import annotations
@@ -207,7 +207,7 @@ class Driver(SpunNode):
         self._odom = node.create_publisher(Odometry, "odom", 10)
         self._scan = node.create_publisher(LaserScan, "scan", qos.SENSOR)
         self._imu = node.create_publisher(Imu, "imu", qos.SENSOR) if has_imu else None
-        self._truth = node.create_publisher(Odometry, "ground_truth", 10)
+        self._truth = node.create_publisher(Odometry, "true_pose", 10)
         self._touch = node.create_publisher(Bool, "touched", 10)
 
     def _take_command(self, message: TwistStamped) -> None:
