@@ -196,19 +196,6 @@ CAMPAIGNS: dict[str, Campaign] = {
             ),
         },
     ),
-    "nav2_standards": Campaign(
-        "--parts nav2 --episodes 3",
-        {
-            "bare": Control(
-                "a known controller, and all nodes but the simulator",
-                "follow_path_success",
-                "--parts nav2 --episodes 1",
-            )
-        },
-        ("rclpy", "nav2_msgs", "nav2"),
-        "standards",
-        timeout_s=900.0,
-    ),
     "generated": Campaign(
         "--engines dart --robots differential --train 40 --unseen 15",
         {
@@ -342,6 +329,19 @@ CAMPAIGNS: dict[str, Campaign] = {
             ),
         },
         MESSAGES,
+        timeout_s=900.0,
+    ),
+    "nav2_standards": Campaign(
+        "--parts nav2 --episodes 3",
+        {
+            "bare": Control(
+                "a known controller, and all nodes but the simulator",
+                "follow_path_success",
+                "--parts nav2 --episodes 1",
+            )
+        },
+        ("rclpy", "nav2_msgs", "nav2"),
+        "standards",
         timeout_s=900.0,
     ),
     "torn_files": Campaign(
