@@ -36,7 +36,7 @@ STEPS_PER_EPISODE = 20
 SAMPLE_S = 5.0
 PATIENCE_S = 90.0
 GOAL_AGAIN_S = 1.0
-FIRST_GOAL_S = 15.0
+FIRST_GOAL_MINUTES = 0.25
 STOPPED = "stopped, "  # stands before a rule in the gate's diagnostics
 BARS = {
     "unexplained_stops": at_most(0),
@@ -85,12 +85,9 @@ class Drive(SpunNode):
                 self.stops[value.key.removeprefix(STOPPED)] = int(value.value)
 
     def arm(self) -> None:
-        """Arms the gate, again and again until a goal is reached."""
-        deadline_s = time.monotonic() + PATIENCE_S
-        while not self.goals and time.monotonic() < deadline_s:
-            for service in ("reset", "arm"):
-                self.call_service(Trigger, f"command_gate/{service}", PATIENCE_S)
-            self.until(lambda: self.goals, FIRST_GOAL_S)
+        """Arms the gate, if it agrees."""
+        for service in ("reset", "arm"):
+            self.call_service(Trigger, f"command_gate/{service}", PATIENCE_S)
 
     def go_on(self) -> None:
         """Handles what has come."""
@@ -161,8 +158,12 @@ class Soak:
         stack.callback(self.drive.close)
         self.episodes = Episodes(track, leaks=control == "leak")
         stack.callback(self.episodes.env.close)
-        if control != "standing":
+        deadline_s = time.monotonic() + PATIENCE_S
+        while control != "standing" and time.monotonic() < deadline_s:
             self.drive.arm()
+            self.run(FIRST_GOAL_MINUTES)
+            if self.drive.goals:
+                break
 
     def measure_uses(self) -> dict[str, Use]:
         """Returns what each process uses now."""
