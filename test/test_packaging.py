@@ -70,6 +70,12 @@ from {PACKAGE}.config import share_folder
 print({PACKAGE}.__version__, {PACKAGE}.__file__, share_folder(), sep="\\n")
 """
 
+NOTHING_OF_TRAINING = """
+from importlib.util import find_spec
+there = [*filter(find_spec, ("torch", "stable_baselines3", "mujoco", "tensorboard"))]
+assert not there, there
+"""
+
 LOAD_ENTRY_POINTS = f"""
 from importlib.metadata import distribution
 from types import ModuleType
@@ -388,6 +394,7 @@ def test_a_release_runs_the_demo_outside_of_the_repository(dist, kind, tmp_path)
         (uv, "venv", "--python", sys.executable, tmp_path / "venv"),
         (uv, "pip", "install", "--python", python, *constraints, release),
         (python, "-c", WHERE_AM_I),
+        (python, "-c", NOTHING_OF_TRAINING),
         (python.with_name("nics"), *demo),
     ):
         told = run_apart(*command, cwd=tmp_path)

@@ -8,8 +8,8 @@ from pathlib import Path
 from nics_drl_bridge import defaults
 from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.identify.report import conclude
 from nics_drl_bridge.policy.evaluation import Episode, Summary, deviation, successes
 from nics_drl_bridge.report import html, pictures
 from nics_drl_bridge.report.fit_page import (

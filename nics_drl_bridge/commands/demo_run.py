@@ -27,7 +27,7 @@ from nics_drl_bridge.errors import BackendError, PolicyError
 from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel, generate, mount_lidar, save_model
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.report import conclude, format_opening
+from nics_drl_bridge.identify.report import format_opening
 from nics_drl_bridge.policy import evaluation
 from nics_drl_bridge.policy.evaluation import FIRST_SEED, Episode, Summary, successes
 from nics_drl_bridge.policy.policies import (

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
-from campaign import ROOT, Given, Result, at_least, at_most, run_campaign
+from campaign import ROOT, Given, Result, at_least, at_most, run_campaign, tell
 from dart_worlds import Comparison, compare_readings
 
 from nics_drl_bridge.sim import barn
@@ -112,7 +112,7 @@ def read_all(jobs: list[Job]) -> Iterator[Comparison]:
     )
     with pool:
         for job, compared in zip(jobs, pool.map(read_twice, jobs), strict=True):
-            sys.stderr.write(f"world {job.number}: {compared}\n")
+            tell(f"world {job.number}: {compared}")
             yield compared
 
 

@@ -1,10 +1,10 @@
 """Does damaged or hostile input do harm? Every loader gets files that Hypothesis has damaged.
 
 Recordings, models, lidar tables, black boxes, policies, checkpoints, bags of this package and of
-others, CSV and YAML are cut, changed in some bytes or in a value, replaced by what is no file, or
-by what would take memory, time or run code. What is bad has to be refused in one sentence, within
-2 s of the process's own time and 500 MB beyond what the libraries take; where damage is not found,
-what is read has to be what was written; and what is whole has to be taken.
+others, CSV and YAML are cut, changed in some bytes or in a value, or replaced by what is no file.
+What is bad has to be refused in one sentence, within 2 s of the process's own time and 500 MB
+beyond what the libraries take; where damage is not found, what is read has to be what was written;
+and what is whole has to be taken.
 """
 
 from __future__ import annotations
@@ -13,17 +13,18 @@ import contextlib
 import tempfile
 from collections import Counter
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
+import yaml
 from campaign import Given, Result, at_least, at_most, run_campaign
 from hypothesis import HealthCheck, Phase, seed, settings
 from hypothesis import given as drawn
 from hypothesis import strategies as st
-from parts.attempt import MOST_MEMORY, Attempt, Outcome, make
-from parts.damage import attempts
+from parts.attempt import MOST_MEMORY, Attempt, Outcome, make_attempt
+from parts.damage import draw_attempts
 from parts.loaders import LOADERS
 
+from nics_drl_bridge import config
 from nics_drl_bridge.kernels import COMPILING
 
 WRONG = ("accepted", "tracebacks", "hangs", "over_memory", "good_refused")
@@ -44,42 +45,27 @@ CHECKS = tuple(
 )
 
 
-@contextlib.contextmanager
-def take_out(control: str | None) -> Any:
+def take_out(control: str | None, stack: contextlib.ExitStack) -> None:
     """Takes out what a control takes out, here and in all forked processes."""
-    with contextlib.ExitStack() as stack:
-        for place in {"no_checksum": CHECKSUMS, "credulous": CHECKS}.get(
-            control or "", ()
-        ):
-            patch = mock.patch(f"nics_drl_bridge.{place}", return_value=True)
-            stack.enter_context(patch)
-        if control == "credulous":
-            import yaml
-
-            from nics_drl_bridge import config
-
-            patch = mock.patch.multiple(
-                config, _Loader=yaml.SafeLoader, MAX_BYTES=10**9
-            )
-            stack.enter_context(patch)
-        yield
+    taken = {"no_checksum": CHECKSUMS, "credulous": CHECKS}
+    for place in taken.get(control or "", ()):
+        stack.enter_context(mock.patch(f"nics_drl_bridge.{place}", return_value=True))
+    if control == "credulous":
+        changes = {"_Loader": yaml.SafeLoader, "MAX_BYTES": 10**9}
+        stack.enter_context(mock.patch.multiple(config, **changes))
 
 
 def judge(attempt: Attempt, outcome: Outcome) -> list[str]:
     """Returns which bars an attempt misses."""
-    missed = []
-    if outcome.end in ("traceback", "hang"):
-        missed.append(f"{outcome.end}s")
-    elif outcome.end == "changed" or (outcome.end, attempt.verdict) == (
-        "accepted",
-        "bad",
-    ):
-        missed.append("accepted")
-    elif (outcome.end, attempt.verdict) == ("refused", "good"):
-        missed.append("good_refused")
-    if outcome.memory > MOST_MEMORY:
-        missed.append("over_memory")
-    return missed
+    wrong = {
+        "tracebacks": outcome.end == "traceback",
+        "hangs": outcome.end == "hang",
+        "accepted": outcome.end == "changed"
+        or (outcome.end == "accepted" and attempt.verdict == "bad"),
+        "good_refused": outcome.end == "refused" and attempt.verdict == "good",
+        "over_memory": outcome.memory > MOST_MEMORY,
+    }
+    return [bar for bar, is_missed in wrong.items() if is_missed]
 
 
 def measure(given: Given) -> Result:
@@ -106,8 +92,8 @@ def measure(given: Given) -> Result:
         )
         @drawn(st.data())
         def hand_in(data: st.DataObject) -> None:
-            attempt = data.draw(attempts(wholes, Path(name) / "damaged"))
-            outcome = make(attempt)
+            attempt = data.draw(draw_attempts(wholes, Path(name) / "damaged"))
+            outcome = make_attempt(attempt)
             counts.update(tries=1, good=int(attempt.verdict == "good"))
             kinds[attempt.kind] += 1
             for bar in judge(attempt, outcome):
@@ -115,7 +101,8 @@ def measure(given: Given) -> Result:
                 line = f"{bar}: {attempt.kind}: {attempt.told}: {outcome.words}"
                 told.append(f"{line} ({outcome.own_s:.1f} s)")
 
-        with take_out(given.control):
+        with contextlib.ExitStack() as stack:
+            take_out(given.control, stack)
             hand_in()
     return {**counts, "by_kind": dict(kinds), "told": told}
 

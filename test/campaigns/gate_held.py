@@ -2,84 +2,69 @@
 
 In the fast simulator, robots with real lidars' noise are driven by planners, policies and random
 commands through the shipped worlds, people among them. Their odometry drifts: scales of path and
-turn are wrong, that of a skid-steer robot's turns by 30 %. A gate watches each, and its rule
+turn are wrong, those of a skid-steer robot's turns by 30 %. A gate watches each, and its rule
 `body_held` must not stop it in all those hours. Then bodies are held while the wheels turn on, and
-the gate must stop each within a second. Nobody obeys the gates, so that all is driven as it is.
+the gate must stop each within a second. Nobody obeys the gates, so all is driven as it is.
 """
 
 from __future__ import annotations
 
-import sys
 import warnings
 
 import numpy as np
-from campaign import Given, Result, at_least, at_most, missed_bars, run_campaign
+from campaign import Given, Result, at_least, at_most, missed_bars, run_campaign, tell
 from parts.held_body import RULE, Case, Tally, drive_freely, hold_bodies
 
 from nics_drl_bridge.gate import scan_motion
-from nics_drl_bridge.gate.state import GateConfig, replace
 
+HOKUYO = "hokuyo_ust_10lx"
+SICK = "sick_tim571"
+BURGER = "turtlebot3_burger"
+DIFFERENTIAL = "differential"
 CASES = (
     Case("jackal", "crowd", turn_scale=1.3),
     Case("jackal", "room", driver="random", rate=20.0, turn_scale=1.3),
-    Case("turtlebot3_burger", "room", rate=5.0),
+    Case(BURGER, "room", rate=5.0),
     Case("turtlebot3_waffle", "arena", driver="random", rate=5.0, path_scale=1.1),
-    Case("turtlebot3_burger", "crowd", rate=5.0, path_scale=0.9, turn_scale=1.3),
-    Case("differential", "crowd", "hokuyo_ust_10lx", "random", 40.0, turn_scale=1.3),
-    Case("differential", "corridor", "rplidar_a1", rate=5.5, path_scale=0.9),
+    Case(BURGER, "crowd", rate=5.0, path_scale=0.9, turn_scale=1.3),
+    Case(DIFFERENTIAL, "crowd", HOKUYO, "random", 40.0, turn_scale=1.3),
+    Case(DIFFERENTIAL, "corridor", "rplidar_a1", rate=5.5, path_scale=0.9),
     Case(
-        "differential",
-        "arena",
-        "sick_tim571",
-        "random",
-        beams=180,
-        turn_scale=1.3,
-        dropout=0.05,
+        DIFFERENTIAL, "arena", SICK, "random", beams=180, turn_scale=1.3, dropout=0.05
     ),
-    Case("differential", "arena", driver="differential", turn_scale=1.3),
-    Case("mecanum", "clutter", "sick_tim571", rate=15.0, path_scale=1.1, dropout=0.1),
+    Case(DIFFERENTIAL, "arena", driver=DIFFERENTIAL, turn_scale=1.3),
+    Case("mecanum", "clutter", SICK, rate=15.0, path_scale=1.1, dropout=0.1),
     Case("mecanum", "crowd", "rplidar_a2", "random", path_scale=0.95, turn_scale=0.9),
-    Case("ackermann", "corridor", "hokuyo_ust_10lx", rate=20.0, beams=180),
-    Case(
-        "ackermann", "doorway", "sick_tim571", "random", path_scale=1.05, noise_told=0.0
-    ),
+    Case("ackermann", "corridor", HOKUYO, rate=20.0, beams=180),
+    Case("ackermann", "doorway", SICK, "random", path_scale=1.05, noise_told=0.0),
 )
 WORLDS = 8
 WITHIN_S = 1.0
+# share of the held bodies to be stopped within that time: of some, no scan tells enough
 LEAST_STOPPED = 0.94
-"""Share of the held bodies that must be stopped within that time: of some, no scan tells enough."""
-LEAST_JUDGED = 0.5
-"""Share of the time of driving in which scans must have told something about the motion."""
-
-
-def zero_thresholds() -> None:
-    """Lets any scan contradict odometry, in this process."""
-    scan_motion.SETTINGS = scan_motion.Settings(
-        min_path=1e-9,
-        min_turn=1e-9,
-        min_half=0.0,
-        min_half_motion=0.0,
-        usual_half=1e-9,
-        min_change=0.0,
-        min_deviations=0.0,
-        min_sectors=1,
-        min_contradicting=0.0,
-        sector_share=np.inf,
-        held_share=np.inf,
-        confirmed_s=0.0,
-        max_changed=np.inf,
-    )
+LEAST_JUDGED = 0.5  # share of the driven time in which scans tell about the motion
 
 
 def measure(given: Given) -> Result:
     """Drives freely, then holds bodies, in all cases."""
     warnings.simplefilter("ignore")  # robots may go faster than their recordings did
-
-    def change(config: GateConfig) -> GateConfig:
-        return replace(config, stop_when_held=given.control != "rule_off")
-
+    has_rule = given.control != "rule_off"
     if given.control == "zero_thresholds":
-        zero_thresholds()
+        scan_motion.SETTINGS = scan_motion.Settings(
+            min_path=1e-9,
+            min_turn=1e-9,
+            min_half=0.0,
+            min_half_motion=0.0,
+            usual_half=1e-9,
+            min_change=0.0,
+            min_deviations=0.0,
+            min_sectors=1,
+            min_contradicting=0.0,
+            sector_share=np.inf,
+            held_share=np.inf,
+            confirmed_s=0.0,
+            max_changed=np.inf,
+        )
     cases = CASES if given.case is None else [CASES[index] for index in given.case]
     seconds = 3600.0 * given.hours / len(cases) / WORLDS
     holds = -(-given.holds // len(cases))
@@ -87,14 +72,11 @@ def measure(given: Given) -> Result:
     held = Tally()
     for index, case in enumerate(cases):
         seed = given.seed + 1000 * index
-        free.add(drive_freely(case, WORLDS, seconds, seed, change))
-        held.add(hold_bodies(case, WORLDS, holds, seed + 500, change))
+        free.add(drive_freely(case, WORLDS, seconds, seed, has_rule))
+        held.add(hold_bodies(case, WORLDS, holds, seed + 500, has_rule))
         late = f"{len(held.missed)} of {len(held.delays_s)} held bodies stopped late"
-        sys.stderr.write(
-            f"{case.robot} in {case.world}: {len(free.trips)} trips so far, {late}\n"
-        )
+        tell(f"{case.robot} in {case.world}: {len(free.trips)} trips so far, {late}")
     delays = np.array(held.delays_s or [np.inf])
-    asked = given.hours, holds * len(cases)
     return {
         "hours": free.driven_s / 3600.0,
         "judged_share": free.judged_s / max(free.driven_s, 1e-9),
@@ -105,7 +87,7 @@ def measure(given: Given) -> Result:
         "median_s": float(np.median(delays)),
         "late": held.missed[:20],
         "other_stops": dict(free.other_stops + held.other_stops),
-        "asked": asked,
+        "asked": (given.hours, holds * len(cases)),
     }
 
 

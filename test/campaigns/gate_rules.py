@@ -9,13 +9,13 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
+from typing import NoReturn
 
 from campaign import ROOT, Given, Result, run_campaign
 
 from nics_drl_bridge.gate import arming, evidence, gate, intake, stops
 
-LEAST_RULES = 30
-"""There are more; a run that found fewer has lost a table."""
+LEAST_RULES = 30  # a run that finds fewer has lost a table
 TESTS = "test/gate"
 UNTESTED = "covers_nothing"  # a rule that stops nothing: nobody can miss it
 OTHER_TEST = "test/gate/test_stopping.py"
@@ -28,8 +28,8 @@ TABLES = {
 }
 
 
-def names() -> list[str]:
-    """Every rule as `table/name`."""
+def list_rules() -> list[str]:
+    """Returns every rule as `table/name`."""
     return [
         f"{kind}/{name_of(row)}"
         for kind, (module, table, name_of) in TABLES.items()
@@ -44,7 +44,8 @@ def take_out(name: str) -> None:
     rows = getattr(module, table)
     kept = [row for row in rows if name_of(row) != rule]
     if len(kept) != len(rows) - 1:
-        raise SystemExit(f"there is no rule {name!r}; known are {', '.join(names())}")
+        known = ", ".join(list_rules())
+        raise SystemExit(f"there is no rule {name!r}; known are {known}")
     is_named = isinstance(rows, dict)
     setattr(module, table, {key: rows[key] for key in kept} if is_named else kept)
 
@@ -55,46 +56,41 @@ def add_untested() -> None:
     stops.STOPS = (*stops.STOPS, nothing)
 
 
-def tests_fail_without(name: str | None, control: str, tests: str) -> bool:
-    """Whether some test fails without a rule; or, without a name, at all."""
-    words = [sys.executable, __file__, "--tests", tests, "--inside", name or ""]
-    words += ["--control", control] if control else []
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=600)
-    if done.returncode not in (0, 1):
-        raise SystemExit(
-            f"pytest ended with {done.returncode}:\n{done.stdout}{done.stderr}"
-        )
-    return done.returncode == 1
-
-
-def _inside(name: str, control: str, tests: str) -> int:
-    """Runs the tests without a rule, in this process; the exit code of pytest."""
+def run_inside(name: str, tests: str) -> NoReturn:
+    """Runs the tests without a rule, or with all, in this process; ends with pytest's code."""
     import pytest
 
-    if control == "untested_rule":
-        add_untested()
     if name:
         take_out(name)
-    tests = OTHER_TEST if control == "no_tests" else tests
-    return int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", tests]))
+    raise SystemExit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", tests]))
+
+
+def tests_fail_without(name: str, given: Given) -> bool:
+    """Returns whether some test fails without a rule; or, without a name, at all."""
+    tests = OTHER_TEST if given.control == "no_tests" and name else given.tests
+    words = [sys.executable, __file__, "--tests", tests, "--inside", name]
+    words += ["--control", given.control] if given.control else []
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    if done.returncode not in (0, 1):
+        said = done.stdout + done.stderr
+        raise SystemExit(f"pytest ended with {done.returncode}:\n{said}")
+    return done.returncode == 1
 
 
 def measure(given: Given) -> Result:
     """Takes out one rule after the other."""
-    control = given.control or ""
-    if given.inside is not None:
-        raise SystemExit(_inside(given.inside, control, given.tests))
-    if control == "untested_rule":
+    is_untested = given.control == "untested_rule"
+    if is_untested:
         add_untested()
-    if tests_fail_without(None, control, given.tests):
+    if given.inside is not None:
+        run_inside(given.inside, given.tests)
+    if tests_fail_without("", given):
         raise SystemExit(f"{given.tests} fails as it is; repair that first.")
-    known = names()
-    asked = known if given.rule is None else given.rule
-    if control == "untested_rule":
-        asked = [name for name in known if name.endswith(UNTESTED)]
-    untested = [
-        name for name in asked if not tests_fail_without(name, control, given.tests)
-    ]
+    known = list_rules()
+    asked = given.rule or known
+    if is_untested:
+        asked = [f"stop/{UNTESTED}"]
+    untested = [name for name in asked if not tests_fail_without(name, given)]
     return {"rules": len(known), "looked_at": len(asked), "untested": untested}
 
 

@@ -8,7 +8,6 @@ robot drives again by other commands, by which alone the model predicts its true
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -22,9 +21,10 @@ from campaign import (
     missed_bars,
     run_campaign,
     some_of,
+    tell,
 )
 from fidelity import average_drives
-from transfer import ENGINES, FAST, find_missing, make_simulator
+from transfer import PHYSICS_ENGINES, find_engines, make_simulator
 
 from nics_drl_bridge.extras.physics.simulator import PhysicsSimulator
 from nics_drl_bridge.generator import builtin_model
@@ -33,7 +33,6 @@ from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.sim.world import load_world
 
-PHYSICS_ENGINES = tuple(engine for engine in ENGINES if engine != FAST)
 ROBOTS = ("ackermann", "differential", "jackal", "mecanum")
 GYRO = {"gyro_bias": 0.001, "gyro_noise": 0.01}  # [rad/s]
 WIDE = load_world("empty").model_copy(update={"size": (400.0, 400.0)})
@@ -101,14 +100,12 @@ def judge_generated(engine: str, robot: str, given: Given) -> dict[str, float]:
 
 def measure(given: Given) -> Result:
     """Generates a model of each robot in each engine that is installed."""
-    missing = {engine: find_missing(engine) for engine in given.engines}
-    engines = [engine for engine in given.engines if not missing[engine]]
+    engines, left_out = find_engines(given.engines)
     result: Result = {engine: {} for engine in engines}
     for engine, robot in product(engines, given.robots):
         figures = judge_generated(engine, robot, given)
-        sys.stderr.write(f"{robot} in {engine}: {figures}\n")
+        tell(f"{robot} in {engine}: {figures}")
         result[engine][robot] = figures
-    left_out = {engine: why for engine, why in missing.items() if why}
     return {"engines": result, "left_out": left_out}
 
 
@@ -122,7 +119,7 @@ def judge(result: Result) -> list[str]:
 
 
 OPTIONS = {
-    "engines": some_of(PHYSICS_ENGINES),
+    "engines": some_of(tuple(PHYSICS_ENGINES)),
     "robots": some_of(ROBOTS),
     "train": (120.0, "recorded seconds"),
     "unseen": (30.0, "seconds of each unseen drive"),

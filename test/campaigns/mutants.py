@@ -66,20 +66,16 @@ TIMEOUT_EXTRA_S = 600.0
 CLEAN_TIMEOUT_S = 3 * 3600.0
 NO_TESTS = 5  # pytest's exit code when no test was collected
 
+
+def _pair(*pairs: str) -> dict[str, str]:
+    """Returns each name of a pair by the other one."""
+    names = [pair.split() for pair in pairs]
+    return dict([*names, *(pair[::-1] for pair in names)])
+
+
 # Operators and what replaces them, by kind.
-COMPARED = {
-    "Lt": "Gt",
-    "Gt": "Lt",
-    "LtE": "GtE",
-    "GtE": "LtE",
-    "Eq": "NotEq",
-    "NotEq": "Eq",
-    "Is": "IsNot",
-    "IsNot": "Is",
-    "In": "NotIn",
-    "NotIn": "In",
-}
-SHIFTED = {"Lt": "LtE", "LtE": "Lt", "Gt": "GtE", "GtE": "Gt"}
+COMPARED = _pair("Lt Gt", "LtE GtE", "Eq NotEq", "Is IsNot", "In NotIn")
+SHIFTED = _pair("Lt LtE", "Gt GtE")
 CALCULATED = {
     "Add": "Sub",
     "Sub": "Add",
@@ -281,9 +277,7 @@ class _Sites(ast.NodeVisitor):
             self._add("constant", node, value=larger)
 
     def visit_If(self, node: ast.If) -> None:
-        names = {x.id for x in ast.walk(node.test) if isinstance(x, ast.Name)}
-        names |= {x.attr for x in ast.walk(node.test) if isinstance(x, ast.Attribute)}
-        if names & MACHINE:
+        if {_get_name(part) for part in ast.walk(node.test)} & MACHINE:
             self._visit_all(node.orelse)
             return
         self._add_condition(node.test, True, False)
@@ -318,13 +312,15 @@ class _Sites(ast.NodeVisitor):
 
     def visit_Expr(self, node: ast.Expr) -> None:
         if isinstance(node.value, ast.Call):
-            called = node.value.func
-            name = called.attr if isinstance(called, ast.Attribute) else ""
-            name = called.id if isinstance(called, ast.Name) else name
-            if name in UNCHECKED_CALLS:
+            if _get_name(node.value.func) in UNCHECKED_CALLS:
                 return
             self._replace("call", node, ast.Pass())
         self.generic_visit(node)
+
+
+def _get_name(node: ast.AST) -> str:
+    """Returns the name of a variable or attribute."""
+    return getattr(node, "id", "") or getattr(node, "attr", "")
 
 
 def _find_other(operator: ast.AST, others: dict[str, str]) -> Any:
@@ -636,11 +632,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         mutants = draw(ROOT, asked.seed, asked.rooms, asked.count)
     if asked.list:
         for mutant in mutants:
-            print(
-                json.dumps(
-                    mutant.describe((ROOT / mutant.file).read_text(encoding="utf-8"))
-                )
-            )
+            source = (ROOT / mutant.file).read_text(encoding="utf-8")
+            print(json.dumps(mutant.describe(source)))
         return 0
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         laboratory = Laboratory(Path(folder), ROOT)

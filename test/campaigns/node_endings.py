@@ -10,7 +10,6 @@ elsewhere Python's own handlers are as fast.
 
 from __future__ import annotations
 
-import os
 import signal
 import statistics
 import subprocess
@@ -22,8 +21,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from campaign import Given, Result, run_campaign, some_of
-from parts.processes import busy
+from campaign import (
+    Given,
+    Result,
+    at_most,
+    missed_bars,
+    run_campaign,
+    some_of,
+    tell,
+)
+from parts.processes import keep_busy, make_environment
 
 from nics_drl_bridge.nodes.parameters import NODES
 from nics_drl_bridge.nodes.processes import free_domain_id
@@ -41,7 +48,7 @@ PHASES = {
 }
 COLD = ("compiling", "native")  # into an empty cache
 NEVER_COMPILES = ("record_node",)
-# after its line, a node is ended at moments that are spread over this time [s]
+# After its line, a node is ended at moments that are spread over this time [s].
 MOMENTS_S = 2.0
 MODEL = ["-p", "model:=ackermann"]
 GIVEN = {
@@ -80,20 +87,21 @@ start.start(sys.argv[3], sys.argv[3:])
 """
 
 
-def ended(
-    node: str, phase: str, number: int, control: str | None, folder: Path
+def end_node(
+    node: str, phase: str, number: int, control: str, folder: Path
 ) -> dict[str, Any]:
-    """Ends a node once in a phase: its exit code, the time [s], and what it wrote if it failed."""
+    """Ends a node once in a phase; returns times [s], and its code and log if it failed."""
     log = folder / "log"
-    own = {"ROS_HOME": str(folder), "ROS_LOG_DIR": str(folder)}
+    environment = make_environment(free_domain_id())
+    environment |= {"ROS_HOME": str(folder), "ROS_LOG_DIR": str(folder)}
     if phase in COLD:
-        own["NUMBA_CACHE_DIR"] = str(folder / "cache")
+        environment["NUMBA_CACHE_DIR"] = str(folder / "cache")
     words = ["--ros-args", *GIVEN.get(node, MODEL), "-r", f"__ns:=/{phase}_{number}"]
-    begin = time.monotonic()
+    begin_s = time.monotonic()
     with log.open("wb") as file:
         process = subprocess.Popen(
-            [sys.executable, "-c", START, control or "", phase, node, *words],
-            env=os.environ | own,
+            [sys.executable, "-c", START, control, phase, node, *words],
+            env=environment,
             stdout=file,
             stderr=file,
             stdin=subprocess.DEVNULL,
@@ -101,95 +109,71 @@ def ended(
             start_new_session=True,
         )
     try:
-        deadline = begin + READY_S
         while PHASES[phase] not in log.read_text(errors="replace"):
-            if process.poll() is not None or time.monotonic() > deadline:
-                raise RuntimeError(
-                    f"{node} was never {phase}:\n{log.read_text(errors='replace')}"
-                )
+            if process.poll() is not None or time.monotonic() > begin_s + READY_S:
+                told = log.read_text(errors="replace")
+                raise RuntimeError(f"{node} was never {phase}:\n{told}")
             time.sleep(POLL_S)
-        reached_s = time.monotonic() - begin
+        reached_s = time.monotonic() - begin_s
         time.sleep(number % 10 / 10 * MOMENTS_S)
-        begin = time.monotonic()
+        begin_s = time.monotonic()
         process.send_signal((signal.SIGINT, signal.SIGTERM)[number % 2])
         code: int | None = None
         with suppress(subprocess.TimeoutExpired):
             code = process.wait(PATIENCE_S)
-        took_s = time.monotonic() - begin
+        took_s = time.monotonic() - begin_s
     finally:
         process.kill()
         process.wait()
     told = log.read_text(errors="replace")
     # Until a node runs, the signal may end it as by default.
     codes = (0,) if phase == "running" else (0, -signal.SIGINT, -signal.SIGTERM)
-    clean = code in codes and "Traceback" not in told
-    said = "" if clean else told[-2000:]
-    return {
-        "code": code,
-        "took_s": took_s,
-        "reached_s": reached_s,
-        "clean": clean,
-        "log": said,
-    }
+    is_clean = code in codes and "Traceback" not in told
+    failure = "" if is_clean else f"code {code}: {told[-2000:]}"
+    return {"took_s": took_s, "reached_s": reached_s, "failure": failure}
 
 
-def summary(endings: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The figures of a node's endings in one phase."""
+def summarise(endings: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Returns the figures of a node's endings in one phase."""
+    failures = [ending["failure"] for ending in endings if ending["failure"]]
     return {
-        "reached_s": statistics.median(each["reached_s"] for each in endings),
-        "median_s": statistics.median(each["took_s"] for each in endings),
-        "longest_s": max(each["took_s"] for each in endings),
-        "failed": [each for each in endings if not each["clean"]],
+        "reached_s": statistics.median(ending["reached_s"] for ending in endings),
+        "median_s": statistics.median(ending["took_s"] for ending in endings),
+        "longest_s": max(ending["took_s"] for ending in endings),
+        "failed": len(failures),
+        "failures": failures,
     }
 
 
 def measure(given: Given) -> Result:
-    """All endings, by node and phase."""
-    os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    """Ends all nodes in all phases."""
     found: dict[str, Any] = {}
     cases = [(node, phase) for phase in given.phases for node in given.nodes]
-    with busy(given.loops), tempfile.TemporaryDirectory() as folder:
+    with keep_busy(given.loops):
         for node, phase in cases:
             if phase in COLD and node in NEVER_COMPILES:
                 continue
-            own = [Path(folder) / f"{node}_{phase}_{k}" for k in range(given.times)]
-            for each in own:
-                each.mkdir()
+            endings = []
+            for number in range(given.times):
+                with tempfile.TemporaryDirectory() as folder:
+                    about = node, phase, number, given.control or "", Path(folder)
+                    endings.append(end_node(*about))
             name = f"{node} {phase}"
-            found[name] = summary(
-                [
-                    ended(node, phase, k, given.control, each)
-                    for k, each in enumerate(own)
-                ]
-            )
-            sys.stderr.write(f"{name}: {found[name]['longest_s']:.3f} s at most\n")
-    return {
-        "times": given.times,
-        "loops": given.loops,
-        "limit_s": LIMIT_S,
-        "endings": found,
-    }
+            found[name] = summarise(endings)
+            tell(f"{name}: {found[name]['longest_s']:.3f} s at most")
+    return {"times": given.times, "loops": given.loops, "endings": found}
 
 
 def judge(result: Result) -> list[str]:
     missed = []
-    for name, each in result["endings"].items():
-        quiet = name.endswith("starting") and not result["loops"]
-        if quiet and not each["reached_s"] <= FIRST_LINE_S:
-            bar = f"bar {FIRST_LINE_S:g} at most"
-            missed.append(
-                f"{name}: its first line took {each['reached_s']:.2f} s, {bar}"
-            )
-        if not each["longest_s"] <= LIMIT_S:
-            missed.append(
-                f"{name}: took {each['longest_s']:.2f} s, bar {LIMIT_S:g} at most"
-            )
-        if each["failed"]:
-            codes = sorted({str(one["code"]) for one in each["failed"]})
-            missed.append(
-                f"{name}: {len(each['failed'])} ended badly, codes {', '.join(codes)}"
-            )
+    for name, figures in result["endings"].items():
+        bars = {
+            "longest_s": at_most(LIMIT_S, "took [s]"),
+            "failed": at_most(0, "ended badly"),
+        }
+        if name.endswith("starting") and not result["loops"]:
+            bars["reached_s"] = at_most(FIRST_LINE_S, "its first line took [s]")
+        missed += missed_bars(figures, bars, f"{name}: ")
     return missed
 
 

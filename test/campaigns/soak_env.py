@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import time
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from campaign import (
     some_of,
 )
 from numpy.typing import NDArray
-from parts.processes import use_of
+from parts.processes import measure_use
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 
@@ -31,9 +30,9 @@ LIMIT = 300
 ROUNDS = 20
 WORLDS = 256
 GROWTH = {
-    "rss_growth_mb": at_most(10.0, "memory grew by [MB]"),
-    "fds_growth": at_most(0, "file descriptors more"),
-    "threads_growth": at_most(0, "threads more"),
+    "rss_mb": at_most(10.0, "memory grew by [MB]"),
+    "files": at_most(0, "file descriptors more"),
+    "threads": at_most(0, "threads more"),
 }
 CASE_BARS = {
     "still": at_most(20, "a robot that stood for so many steps"),
@@ -41,6 +40,7 @@ CASE_BARS = {
     "nans": at_most(0, "numbers that are not finite"),
     "episodes": at_least(1, "episodes that ended"),
 }
+# arguments of `BridgeVectorEnv`
 CASES: dict[str, dict[str, Any]] = {
     "arena": {"model": "differential", "world": "arena"},
     "arena, same step": {"model": "ackermann", "autoreset_mode": "SameStep"},
@@ -53,26 +53,10 @@ CASES: dict[str, dict[str, Any]] = {
     },
     "team": {"model": "differential", "world": "arena", "task": "cooperative_reaching"},
 }
-"""Arguments of `BridgeVectorEnv`."""
-
-
-def count_not_finite(*arrays: NDArray[Any]) -> int:
-    """Counts numbers that are not finite."""
-    return sum(int(np.count_nonzero(~np.isfinite(array))) for array in arrays)
 
 
 class Case:
-    """An environment of N worlds with M robots, and what was seen in it.
-
-    Attributes:
-        steps: env steps that were made.
-        nans: numbers that are not finite, in observations, rewards and true poses.
-        episodes: how many ended.
-        longest: steps of the longest episode.
-        still: most steps in a row in which a free robot that was told to move did not.
-        blind: most steps in a row in which a world's robots moved and its observation did not
-            change.
-    """
+    """An environment of N worlds with M robots, and what was seen in it."""
 
     def __init__(self, arguments: dict[str, Any], seed: int, limit: int) -> None:
         self._env = BridgeVectorEnv(WORLDS, max_episode_steps=limit, **arguments)
@@ -81,10 +65,12 @@ class Case:
         self._blind = np.zeros(WORLDS, np.int64)
         self._still = np.zeros((WORLDS, self._env.robots), np.int64)
         self.steps = 0
-        self.nans = 0
-        self.episodes = 0
-        self.longest = 0
+        self.nans = 0  # numbers that are not finite
+        self.episodes = 0  # that ended
+        self.longest = 0  # steps of the longest episode
+        # most steps in a row in which a free robot that was told to move did not
         self.still = 0
+        # most in which a world's robots moved and its observation did not change
         self.blind = 0
 
     def run(self, steps: int, rng: np.random.Generator, control: str | None) -> None:
@@ -99,16 +85,13 @@ class Case:
                 data.pose[0] = before[0]
             elif control == "blind":
                 seen[0] = self._seen[0]
-            self.nans += count_not_finite(seen, reward, data.pose, data.odom)
-            self._count(
-                seen, (data.pose != before).any(axis=-1), terminated | truncated
-            )
+            for array in (seen, reward, data.pose, data.odom):
+                self.nans += int(np.count_nonzero(~np.isfinite(array)))
+            moved = (data.pose != before).any(axis=-1)
+            self._count(seen, moved, terminated | truncated)
 
     def _count(
-        self,
-        seen: NDArray[Any],
-        moved: NDArray[np.bool_],
-        over: NDArray[np.bool_],
+        self, seen: NDArray[Any], moved: NDArray[np.bool_], over: NDArray[np.bool_]
     ) -> None:
         """Counts for how long each world has gone on, stood, and told the same."""
         free = (self._env.simulator.data.collided == 0) & ~self._env.ended
@@ -139,22 +122,18 @@ def measure(given: Given) -> Result:
         for k, name in enumerate(given.cases)
     }
     rng = np.random.default_rng(given.seed)
-    begin = time.perf_counter()
+    steps = math.ceil(given.steps / (ROUNDS * len(cases)))
     uses = []
     held: list[Any] = []
     for _ in range(ROUNDS):
         for case in cases.values():
-            steps = math.ceil(given.steps / (ROUNDS * len(cases)))
             case.run(steps, rng, given.control)
         if given.control == "leak":
             held += [np.ones(2**17), Path(os.devnull).open()]  # noqa: SIM115
-        uses.append(use_of())
+        uses.append(measure_use())
+    growth = np.subtract(uses[-1], uses[1]).tolist()
     return {
-        "steps": sum(case.steps for case in cases.values()),
-        "seconds": time.perf_counter() - begin,
-        "rss_growth_mb": uses[-1].rss_mb - uses[1].rss_mb,
-        "fds_growth": uses[-1].files - uses[1].files,
-        "threads_growth": uses[-1].threads - uses[1].threads,
+        "growth": dict(zip(GROWTH, growth, strict=True)),
         "cases": {name: case.describe() for name, case in cases.items()},
         "limit": given.limit,
     }
@@ -162,10 +141,9 @@ def measure(given: Given) -> Result:
 
 def judge(result: Result) -> list[str]:
     longest = at_most(result["limit"] + 1, "an episode of so many steps")
-    bars = CASE_BARS | {"longest": longest}
-    missed = missed_bars(result, GROWTH)
+    missed = missed_bars(result["growth"], GROWTH)
     for name, case in result["cases"].items():
-        missed += missed_bars(case, bars, f"{name}: ")
+        missed += missed_bars(case, CASE_BARS | {"longest": longest}, f"{name}: ")
     return missed
 
 

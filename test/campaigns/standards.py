@@ -1,69 +1,58 @@
-"""Do our nodes speak the standards of others: simulation_interfaces, Nav2, LEAPP?
+"""Do our nodes speak the standards of others: simulation_interfaces and Nav2?
 
 - simulation_interfaces: a client calls every feature that `simulator_node` announces, and sees that
   it does what the standard says, and that each other one is answered as unsupported.
-- LEAPP: a policy that comes with the package is exported as a bundle, which LEAPP runs; both are
-  given the same observations.
-- Nav2: what `nav2_standards` measures, by its bars; its control is its own.
+- Nav2: paths that are planned on the map are sent to `follow_path`, in lock-step over DDS, by a
+  stand-in for the behaviour tree; one is followed if the action succeeds, at the goal, without a
+  touch. Then the topics, frames, types, qualities of service and actions are counted that Nav2's
+  parameter file names and nobody serves.
 
-Bars: no check fails, and both policies give the same actions. The controls announce a feature that
-is not there, do nothing of what is asked for, or round what LEAPP is given.
+Both need message packages: source what `nox -s messages` builds.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import os
+import tarfile
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
-import nav2_standards
-import numpy as np
-from campaign import Given, Result, at_most, missed_bars, run_campaign, some_of
+from campaign import (
+    NAV2_SOURCES,
+    Given,
+    Result,
+    at_least,
+    at_most,
+    missed_bars,
+    run_campaign,
+    some_of,
+)
 
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 BARS = {
     "sim_conformance_failed": at_most(0),
-    "leapp_max_abs_difference": at_most(1e-6),
+    "follow_path_success": at_least(0.95),
+    "nav2_names_missing": at_most(0),
 }
-ROBOT = "ackermann"
-WORLD = "circles"
 CLAIMED = "NAMED_POSES"
-OBSERVATIONS = 64
-POLICY = "differential"
+UPSTREAM = "navigation2/nav2_bringup/params/nav2_params.yaml"
 
 
-@contextmanager
-def simulator(
-    domain_id: int, folder: Path, namespace: str, mode: str
-) -> Iterator[None]:
-    """A simulator node in a process of its own, which listens to a Twist."""
-    folder.mkdir(exist_ok=True)
-    given = {
-        "model": ROBOT,
-        "world": WORLD,
-        "mode": mode,
-        "enable_stamped_cmd_vel": False,
-    }
-    with NodeProcess("simulator_node", folder, given, domain_id, namespace):
-        yield
-
-
-def conformance(domain_id: int, folder: Path, control: str | None) -> dict[str, Any]:
-    """How many features are announced, and the sentences about those that fail."""
+def check_conformance(folder: Path, given: Given) -> Result:
+    """Counts the announced features, and those that fail, with a sentence about each."""
     from parts.conformance import Client, announced, failures
 
-    namespace = f"conformance_{os.getpid()}"
-    with simulator(domain_id, folder / "conformance", namespace, "realtime"):
-        client = Client(domain_id, f"/{namespace}")
+    domain_id = free_domain_id()
+    space = f"conformance_{os.getpid()}"
+    parameters = {"model": "ackermann", "world": "circles"}
+    parameters |= {"mode": "realtime", "enable_stamped_cmd_vel": False}
+    with NodeProcess("simulator_node", folder, parameters, domain_id, space):
+        client = Client(domain_id, f"/{space}")
         try:
             told = announced(client)
-            client.idle = control == "idle"
-            claimed = told | {CLAIMED} if control == "claims" else told
+            client.idle = given.control == "idle"
+            claimed = told | {CLAIMED} if given.control == "claims" else told
             failed = failures(client, "empty", claimed)
         finally:
             client.close()
@@ -74,80 +63,46 @@ def conformance(domain_id: int, folder: Path, control: str | None) -> dict[str, 
     }
 
 
-def leapp(folder: Path, control: str | None) -> dict[str, float]:
-    """Greatest difference of what a shipped policy and its bundle, run by LEAPP, do."""
-    import torch
-    from leapp import InferenceManager
+def check_nav2(folder: Path, given: Given) -> Result:
+    """Counts the paths that are followed, and the names that nobody serves."""
+    from parts.nav2 import find_missing, follow_paths
 
-    from nics_drl_bridge.extras.foreign_policies import export_bundle
-    from nics_drl_bridge.policy.file.contract import shipped
-    from nics_drl_bridge.policy.file.policy_file import load_policy
-
-    policy = load_policy(shipped() / f"{POLICY}.onnx")
-    manager = InferenceManager(str(export_bundle(policy, folder / "bundle")))
-    layout = policy.contract.observation
-    random = np.random.default_rng(0)
-    scans = random.uniform(0.0, 1.0, (OBSERVATIONS, layout.scan_parts))
-    rest = random.uniform(
-        layout.rest_low, layout.rest_high, (OBSERVATIONS, len(layout.rest_low))
-    )
-    gap = 0.0
-    zero = np.zeros(1)
-    for row in np.concatenate([scans, rest], axis=1).astype(np.float32):
-        scan, goal, velocity = np.split(row, [layout.scan_parts, layout.scan_parts + 3])
-        pieces = {
-            "scan": scan,
-            "goal": goal,
-            "linear_velocity": np.concatenate([velocity[:2], zero]),
-            "angular_velocity": np.concatenate([zero, zero, velocity[2:]]),
-        }
-        if control == "coarse":
-            pieces = {name: each.round(2) for name, each in pieces.items()}
-        given = {
-            f"policy/{name}": torch.as_tensor(each.astype(np.float32)[None])
-            for name, each in pieces.items()
-        }
-        theirs = manager(given)
-        for name, ours in zip(
-            ("action", "command"), policy.run(row[None]), strict=True
-        ):
-            gap = max(gap, float(np.abs(theirs[f"policy/{name}"].numpy() - ours).max()))
-    return {"leapp_max_abs_difference": gap}
+    is_bare = given.control == "bare"
+    file = given.parameters
+    if file is None:
+        with tarfile.open(NAV2_SOURCES) as archive:
+            archive.extract(UPSTREAM, folder, filter="data")
+        file = folder / UPSTREAM
+    missing = find_missing(folder / "names", file, is_bare)
+    not_followed = follow_paths(folder / "paths", given.episodes, is_bare)
+    return {
+        "nav2_names_missing": len(missing),
+        "missing": missing,
+        "follow_path_success": 1.0 - len(not_followed) / given.episodes,
+        "not_followed": not_followed,
+    }
 
 
-def judge(result: Result) -> list[str]:
-    measured = {name: bar for name, bar in BARS.items() if name in result}
-    missed = missed_bars(result, measured)
-    if "map_agreement" in result:
-        missed += missed_bars(result, nav2_standards.BARS)
-    return [*missed, *result.get("failed", [])]
-
-
-NOT_BUILT = "simulation_interfaces: source what `nox -s messages` builds"
-SIMULATION = ("sim_features", "sim_conformance_failed")
-PARTS = ("conformance", "leapp", "nav2")
+PARTS = {"conformance": check_conformance, "nav2": check_nav2}
 
 
 def measure(given: Given) -> Result:
-    """All figures of the parts that were asked for."""
-    domain_id = free_domain_id()
-    result = dict[str, Any]()
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        built = importlib.util.find_spec("simulation_interfaces") is not None
-        if "conformance" in given.parts and not built:
-            result |= dict.fromkeys(SIMULATION, np.nan) | {"failed": [NOT_BUILT]}
-        if "conformance" in given.parts and built:
-            result |= conformance(domain_id, folder, given.control)
-        if "leapp" in given.parts:
-            result |= leapp(folder, given.control)
-        if "nav2" in given.parts:
-            result |= nav2_standards.figures(parameters=given.parameters)
+    """Checks the parts that were asked for."""
+    result: Result = {}
+    for part in given.parts:
+        with tempfile.TemporaryDirectory() as folder:
+            result |= PARTS[part](Path(folder), given)
     return result
 
 
+def judge(result: Result) -> list[str]:
+    bars = {name: bar for name, bar in BARS.items() if name in result}
+    return [*missed_bars(result, bars), *result.get("failed", [])]
+
+
 OPTIONS = {
-    "parts": some_of(PARTS),
+    "parts": some_of(tuple(PARTS)),
+    "episodes": (20, "paths to follow"),
     "parameters": {"type": Path, "help": "another parameter file of Nav2"},
 }
 

@@ -11,13 +11,11 @@ from importlib.util import find_spec
 
 import pytest
 
-from .campaign import CAMPAIGNS, FOLDER, Campaign
+from .campaign import CAMPAIGNS, FOLDER, NAV2_SOURCES, ROOT, Campaign
 
-ROOT = FOLDER.parents[1]
-NAV2 = ROOT.parent / "shared" / "upstream" / "nav2_interfaces.tar.gz"
 UNMET = {
     "root": os.geteuid() != 0 or None in map(shutil.which, ("ip", "nft")),
-    "nav2": not NAV2.is_file(),
+    "nav2": not NAV2_SOURCES.is_file(),
 }
 MARGIN_S = 60.0
 
@@ -52,13 +50,9 @@ CONTROLS = [
 def run(name: str, *arguments: str) -> tuple[int, list[str]]:
     """The exit code of a campaign, and the bars that it says it missed."""
     campaign = CAMPAIGNS[name]
+    script = FOLDER / f"{campaign.script or name}.py"
     done = subprocess.run(
-        [
-            sys.executable,
-            str(FOLDER / f"{campaign.script or name}.py"),
-            "--json",
-            *arguments,
-        ],
+        [sys.executable, str(script), "--json", *arguments],
         capture_output=True,
         text=True,
         cwd=ROOT,

@@ -1,4 +1,7 @@
-"""A third engine that nobody here wrote, built on the parts that all engines share."""
+"""A third engine that nobody here wrote, built on the parts that all engines share.
+
+It passes the tests of the engines that come with the package, as far as it has one robot.
+"""
 
 from __future__ import annotations
 
@@ -8,72 +11,76 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+pytest.importorskip("pybullet", reason="needs PyBullet: pip install pybullet==3.2.7")
+
+from extras.physics import test_simulators as shared
+from extras.physics.driving import drive
+from extras.physics.engines import Engine
+from extras.physics.test_simulators import (  # noqa: F401
+    test_a_footprint_of_corners_touches_by_its_corners,
+    test_a_robot_that_drives_into_a_wall_stops_there_and_has_collided,
+    test_a_wrong_command_is_refused,
+    test_an_episode_is_the_same_bits_whatever_was_before,
+    test_lidar_faults_are_drawn_as_in_the_fast_simulator,
+    test_wheel_odometry_is_wrong_after_a_turn_in_which_the_wheels_skid,
+)
+
 from nics_drl_bridge import geometry
-from nics_drl_bridge.generator import SimulatorModel, builtin_model
+from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import World, load_world
+from nics_drl_bridge.sim.world import load_world
 
 from .campaign import FOLDER
 
-pytest.importorskip("pybullet", reason="needs PyBullet: pip install pybullet==3.2.7")
 pytestmark = pytest.mark.campaign
-WIDE = load_world("empty").model_copy(update={"size": (40.0, 40.0)})
 
 
 @pytest.fixture
-def simulator(monkeypatch):
+def engine(monkeypatch) -> Engine:
     monkeypatch.setattr(sys, "path", [str(FOLDER), *sys.path])
-    from parts.pybullet_simulator import PybulletSimulator
+    from parts.pybullet_simulator import PHYSICS, PybulletSimulator, load_pybullet
 
-    return PybulletSimulator
-
-
-def exact(name: str) -> SimulatorModel:
-    """A shipped model whose lidar measures without noise."""
-    model = builtin_model(name)
-    lidar = model.lidar.model_copy(update={"noise_std": 0.0})
-    return replace(model, lidar=lidar)
-
-
-@pytest.mark.parametrize("world", [load_world("crowd"), load_world("room")], ids=str)
-def test_its_rays_measure_what_the_exact_scanner_computes(
-    simulator, world: World
-) -> None:
-    model = exact("differential")
-    ours = simulator(model, world)
-    theirs = FastSimulator(model, world, renderer="exact")
-    far = beams = 0
-    for seed in range(4):
-        for each in (ours, theirs):
-            each.reset([seed])
-        pair = ours.data.ranges[0, 0], theirs.data.ranges[0, 0]
-        assert np.isfinite(pair[0]).sum() > 100
-        far += int((~np.isclose(*pair, rtol=0.0, atol=0.01)).sum())
-        beams += model.lidar.beams
-    assert far <= 0.002 * beams
+    return Engine(
+        name="PyBullet",
+        extra="",
+        library="pybullet",
+        load=load_pybullet,
+        robot=None,
+        simulator=PybulletSimulator,
+        physics=PHYSICS,
+        rest_error=3e-3,
+        encoder_error=0.02,
+        skid_error=0.1,
+        slip_error=0.07,
+        wall_error=0.015,
+    )
 
 
 @pytest.mark.parametrize("name", ["ackermann", "differential", "mecanum"])
-def test_a_robot_that_does_not_slip_moves_nearly_as_the_model_says(simulator, name):
-    model = builtin_model(name)
-    command = np.zeros((1, 1, len(model.robot.command)))
-    command[..., 0] = 0.6
-    command[..., -1] = 0.4 * model.robot.command_high[-1]
-    moved = []
-    for each in (simulator(model, WIDE), FastSimulator(model, WIDE)):
-        each.reset([0], starts=np.zeros((1, 1, 3)))
-        for _ in range(15):
-            each.step(command)
-        before = each.data.pose[0, 0].copy()
-        for _ in range(5):
-            each.step(command)
-        step = geometry.between(before, each.data.pose[0, 0])
-        moved.append([np.hypot(*step[:2]), step[2]])
-    assert moved[0] == pytest.approx(moved[1], rel=0.07)
+def test_a_robot_that_does_not_slip_moves_nearly_as_the_model_says(engine, name):
+    shared.test_a_robot_that_does_not_slip_moves_nearly_as_the_model_says(engine, name)
 
 
-def test_a_jackal_skids_in_turns(simulator):
-    ours = simulator(builtin_model("jackal"), WIDE)
+@pytest.mark.parametrize("world", [load_world("crowd"), load_world("room")], ids=str)
+def test_its_rays_measure_what_the_exact_scanner_computes(engine, world):
+    model = builtin_model("differential")
+    lidar = model.lidar.model_copy(update={"noise_std": 0.0})
+    model = replace(model, lidar=lidar)
+    ours = engine.simulator(model, world)
+    theirs = FastSimulator(model, world, renderer="exact")
+    far = 0
+    for seed in range(4):
+        for simulator in (ours, theirs):
+            simulator.reset([seed])
+        pair = ours.data.ranges[0, 0], theirs.data.ranges[0, 0]
+        assert np.isfinite(pair[0]).sum() > 100
+        far += int((~np.isclose(*pair, rtol=0.0, atol=0.01)).sum())
+    assert far <= 0.002 * 4 * lidar.beams
+
+
+def test_a_jackal_skids_in_turns(engine):
+    world = load_world("empty").model_copy(update={"size": (40.0, 40.0)})
+    ours = engine.simulator(builtin_model("jackal"), world)
     ours.reset([0], starts=np.zeros((1, 1, 3)))
     turned = 0.0
     for _ in range(30):
@@ -84,32 +91,10 @@ def test_a_jackal_skids_in_turns(simulator):
     assert turned == pytest.approx(3.0 * 1.5, rel=0.2)
 
 
-@pytest.mark.parametrize("name", ["ackermann", "differential", "jackal", "mecanum"])
-def test_a_robot_that_drives_into_a_wall_stops_there_and_has_collided(simulator, name):
-    model = builtin_model(name)
-    ours = simulator(model, load_world("empty"))
-    ours.reset([0], starts=np.array([[[2.0, 0.0, 0.0]]]))
-    command = np.zeros((1, 1, len(model.robot.command)))
-    command[..., 0] = 0.7
-    collided = []
-    for _ in range(30):
-        ours.step(command)
-        collided.append(int(ours.data.collided[0, 0]))
-    outline = model.robot.footprint or [(model.robot.footprint_radius, 0.0)]
-    assert ours.data.pose[0, 0, 0] == pytest.approx(
-        3.0 - max(x for x, _ in outline), abs=0.015
-    )
-    first = collided.index(1)
-    assert 8 < first < 25
-    assert collided == [0] * first + [1] * (30 - first)
-
-
-def test_putting_obstacles_keeps_the_motion_of_the_robot(simulator):
-    model = builtin_model("differential")
-    ours = simulator(model, load_world("crowd"))
+def test_putting_obstacles_keeps_the_motion_of_the_robot(engine):
+    ours = engine.simulator(builtin_model("differential"), load_world("crowd"))
     ours.reset([2])
-    for _ in range(5):
-        ours.step(np.array([[[0.3, 0.0]]]))
+    drive(ours, np.array([[[0.3, 0.0]]]), 5)
     before = ours._rigs[0].read()
     ours.put_bodies(ours.obstacles[0].copy())
     after = ours._rigs[0].read()

@@ -28,8 +28,8 @@ LONGEST_S = 0.05  # within which a writer is killed after it began to write
 STARTS_S = 10.0  # within which it begins
 LEAST_DURING = 0.25  # fraction of the kills that have to hit a write
 PIECE = 4096  # bytes that a naive writer writes at once, as a buffered file does
+# Shared with the writer: numbers of writes that began, and that ended, modulo 256.
 WRITES = mmap(-1, 2)
-"""Shared with the writer: which number of writes began, and which ended, modulo 256."""
 
 
 def count_torn(
@@ -37,10 +37,10 @@ def count_torn(
 ) -> dict[str, int]:
     """Counts what is neither version, and the kills that hit a write."""
     path = folder / loader.name
-    loader.write(path, 1)
-    versions = [loader.read(path)]
-    loader.write(path, 0)
-    versions.append(loader.read(path))
+    versions = []
+    for version in (1, 0):
+        loader.write(path, version)
+        versions.append(loader.read(path))
     torn = 0
     during = 0
     for _ in range(kills):
@@ -48,27 +48,24 @@ def count_torn(
         child = os.fork()
         if child == 0:
             _write_for_ever(loader, path)
-        latest = time.monotonic() + STARTS_S
-        while WRITES[0] == 0 and time.monotonic() < latest:
+        latest_s = time.monotonic() + STARTS_S
+        while WRITES[0] == 0 and time.monotonic() < latest_s:
             time.sleep(0.0)
         time.sleep(rng.uniform(0.0, LONGEST_S))
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
         during += WRITES[0] != WRITES[1]
-        if not _is_whole(loader, path, versions):
+        try:
+            is_whole = loader.read(path) in versions
+        except BridgeError:
+            is_whole = False
+        if not is_whole:
             torn += 1
             _remove(path)
             loader.write(path, 0)
         for rest in folder.glob(f".{loader.name}.*"):
             _remove(rest)
     return {"torn": torn, "kills": kills, "kills_during_a_write": during}
-
-
-def _is_whole(loader: Loader, path: Path, versions: list[object]) -> bool:
-    try:
-        return loader.read(path) in versions
-    except BridgeError:
-        return False
 
 
 def _remove(path: Path) -> None:

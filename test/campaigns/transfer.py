@@ -13,7 +13,6 @@ alone whether they differ by more than chance. PyBullet has a wheel for Python 3
 from __future__ import annotations
 
 import json
-import sys
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -32,18 +31,24 @@ from campaign import (
     missed_bars,
     run_campaign,
     some_of,
+    tell,
 )
 from measuring.evaluations import Standing
 from measuring.perturbations import open_real_model
+from parts.pybullet_simulator import PHYSICS as PYBULLET_PHYSICS
+from parts.pybullet_simulator import PybulletSimulator, load_pybullet
 
 from nics_drl_bridge.commands.episodes import Conditions, make_env
 from nics_drl_bridge.confidence import compare_pairs, estimate_rate
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.dart.scenery import load_dart
 from nics_drl_bridge.extras.dart.simulator import PHYSICS as DART_PHYSICS
 from nics_drl_bridge.extras.dart.simulator import DartSimulator
+from nics_drl_bridge.extras.mujoco.machines import load_mujoco
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.extras.physics.machines import Physics
+from nics_drl_bridge.gate.assurance.results import cluster_seeds
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy.evaluation import drive
@@ -53,7 +58,13 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 FAST = "fast"
-ENGINES = (FAST, "mujoco", "dart", "pybullet")
+# by name: the simulator, its usual physics, and what says what to install
+PHYSICS_ENGINES: dict[str, tuple[Any, Physics, Callable[[], Any]]] = {
+    "mujoco": (MujocoSimulator, Physics(), load_mujoco),
+    "dart": (DartSimulator, DART_PHYSICS, load_dart),
+    "pybullet": (PybulletSimulator, PYBULLET_PHYSICS, load_pybullet),
+}
+ENGINES = (FAST, *PHYSICS_ENGINES)
 WORLDS = (
     "arena",
     "circles",
@@ -77,12 +88,12 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Job:
-    """Some episodes of a robot in an engine."""
+    """Some episodes of a robot in an engine, and how they are driven."""
 
     robot: str
     engine: str
-    seeds: tuple[int, ...]
-    worlds: tuple[str, ...]
+    seeds: list[int]
+    worlds: list[str]
     randomisation: str
     control: str | None
 
@@ -98,31 +109,16 @@ def make_simulator(
 
     Raises ConfigError if the engine is not installed.
     """
-    if engine == "mujoco":
-        changed = replace(Physics(), **physics)
-        return MujocoSimulator(model, world, physics=changed, randomisation=drawn)
-    if engine == "dart":
-        changed = replace(DART_PHYSICS, **physics)
-        return DartSimulator(model, world, physics=changed, randomisation=drawn)
-    from parts.pybullet_simulator import PHYSICS, PybulletSimulator
-
-    return PybulletSimulator(model, world, replace(PHYSICS, **physics), drawn)
+    make, usual, _ = PHYSICS_ENGINES[engine]
+    changed = replace(usual, **physics)
+    return make(model, world, physics=changed, randomisation=drawn)
 
 
 def find_missing(engine: str) -> str:
     """Returns why an engine can't be driven here; nothing if it can."""
-    from parts.pybullet_simulator import load_pybullet
-
-    from nics_drl_bridge.extras.dart.scenery import load_dart
-    from nics_drl_bridge.extras.mujoco.machines import load_mujoco
-
-    load: dict[str, Callable[[], Any]] = {
-        "mujoco": load_mujoco,
-        "dart": load_dart,
-        "pybullet": load_pybullet,
-    }
     try:
-        load.get(engine, lambda: None)()
+        if engine != FAST:
+            PHYSICS_ENGINES[engine][-1]()
     except ConfigError as error:
         return str(error)
     return ""
@@ -131,7 +127,7 @@ def find_missing(engine: str) -> str:
 def drive_job(job: Job) -> list[Row]:
     """Drives the episodes of a job; returns a row for each."""
     model = open_real_model(job.robot)
-    world = load_worlds(list(job.worlds))
+    world = load_worlds(job.worlds)
     drawn = load_randomisation(job.randomisation)
     backend = SimBackend(model, world, estimator=True, randomisation=drawn)
     if job.engine != FAST:
@@ -153,9 +149,6 @@ def drive_job(job: Job) -> list[Row]:
                 "world": world.members[member].name,
                 "result": episode.result,
                 "believed": episode.believed,
-                "steps": episode.steps,
-                "length": round(episode.length, 3),
-                "miss": round(episode.miss, 3),
             }
             rows.append(row)
     return rows
@@ -166,6 +159,7 @@ class Book:
 
     def __init__(self, file: Path | None, asked: Row) -> None:
         self.file = file
+        self.asked = asked
         self.rows: list[Row] = []
         if file is None:
             return
@@ -183,37 +177,32 @@ class Book:
             with self.file.open("a") as file:
                 file.write("".join(json.dumps(row) + "\n" for row in rows))
 
-    def has(self, robot: str, engine: str, seed: int) -> bool:
-        """Returns whether an episode was driven."""
-        return (robot, engine, seed) in {
-            (row["robot"], row["engine"], row["seed"]) for row in self.rows
-        }
-
 
 def plan_jobs(given: Given, engines: Sequence[str], book: Book) -> list[Job]:
     """Returns what is still to be driven, all engines of a block of seeds before the next."""
     end = FIRST_SEED + given.episodes
+    driven = {(row["robot"], row["engine"], row["seed"]) for row in book.rows}
     jobs = []
     for first in range(FIRST_SEED, end, BLOCK):
         block = range(first, min(first + BLOCK, end))
         for robot, engine in product(given.robots, engines):
-            seeds = tuple(seed for seed in block if not book.has(robot, engine, seed))
-            how = tuple(given.worlds), given.randomisation, given.control
+            seeds = [seed for seed in block if (robot, engine, seed) not in driven]
             if seeds:
-                jobs.append(Job(robot, engine, seeds, *how))
+                jobs.append(Job(robot, engine, seeds, **book.asked))
     return jobs
 
 
-def measure(given: Given) -> Result:
-    """Drives all episodes that are not in the file yet, and compares the engines."""
-    missing = {engine: find_missing(engine) for engine in given.engines}
-    for engine, reason in missing.items():
-        if reason:
-            sys.stderr.write(f"{engine} is left out: {reason}\n")
-    engines = [engine for engine in given.engines if not missing[engine]]
-    about = ("worlds", "randomisation", "control")
-    book = Book(given.out, {name: getattr(given, name) for name in about})
-    jobs = plan_jobs(given, engines, book)
+def find_engines(asked: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+    """Returns the engines that can be driven here, and why the others can't."""
+    missing = {engine: find_missing(engine) for engine in asked}
+    left_out = {engine: reason for engine, reason in missing.items() if reason}
+    for engine, reason in left_out.items():
+        tell(f"{engine} is left out: {reason}")
+    return [engine for engine in asked if engine not in left_out], left_out
+
+
+def drive_jobs(jobs: Sequence[Job], book: Book) -> None:
+    """Drives jobs in processes of their own, and keeps their rows."""
     with ProcessPoolExecutor(AT_ONCE, mp_context=get_context("spawn")) as pool:
         pending = {pool.submit(drive_job, job): job for job in jobs}
         for count, done in enumerate(as_completed(pending), 1):
@@ -222,11 +211,18 @@ def measure(given: Given) -> Result:
             book.add(rows)
             well = sum(row["result"] == "success" for row in rows)
             told = f"{job.robot} in {job.engine}: {well} of {len(rows)}"
-            sys.stderr.write(f"{count} of {len(jobs)}: {told}\n")
-    clusters = find_clusters(book.rows)
+            tell(f"{count} of {len(jobs)}: {told}")
+
+
+def measure(given: Given) -> Result:
+    """Drives all episodes that are not in the file yet, and compares the engines."""
+    engines, left_out = find_engines(given.engines)
+    asked = ("worlds", "randomisation", "control")
+    book = Book(given.out, {name: getattr(given, name) for name in asked})
+    drive_jobs(plan_jobs(given, engines, book), book)
     return {
-        "clusters": clusters,
-        "left_out": {engine: why for engine, why in missing.items() if why},
+        "clusters": find_clusters(book.rows),
+        "left_out": left_out,
         "engines": compare_engines(book.rows, given.robots, engines),
     }
 
@@ -234,25 +230,22 @@ def measure(given: Given) -> Result:
 def find_clusters(rows: Sequence[Row]) -> list[Row]:
     """Returns the failures by robot, engine, world and end, the largest cluster first."""
     ended = {(row["robot"], row["engine"], row["seed"]): row["result"] for row in rows}
-    seeds = defaultdict[tuple[str, ...], list[int]](list)
-    for row in rows:
-        if row["result"] != "success":
-            cluster = row["robot"], row["engine"], row["world"], row["result"]
-            seeds[cluster].append(row["seed"])
-    ordered = sorted(seeds.items(), key=lambda item: (-len(item[1]), item[0]))
+    failed = [
+        ((row["robot"], row["engine"], row["world"], row["result"]), row["seed"])
+        for row in rows
+        if row["result"] != "success"
+    ]
     return [
         {
             "robot": robot,
             "engine": engine,
             "world": world,
             "result": result,
-            "failures": len(failed),
-            "not_in_fast": sum(
-                ended.get((robot, FAST, seed)) == "success" for seed in failed
-            ),
-            "seeds": failed,
+            "failures": len(seeds),
+            "not_in_fast": sum(ended.get((robot, FAST, s)) == "success" for s in seeds),
+            "seeds": seeds,
         }
-        for (robot, engine, world, result), failed in ordered
+        for (robot, engine, world, result), seeds in cluster_seeds(failed)
     ]
 
 
@@ -265,8 +258,8 @@ def compare_engines(
         ended[row["robot"], row["engine"]][row["seed"]] = row
     compared: dict[str, dict[str, Row]] = {robot: {} for robot in robots}
     for robot, engine in product(robots, engines):
-        common = set.intersection(*(set(ended[robot, each]) for each in engines))
-        seeds = sorted(common)
+        driven = [set(ended[robot, each]) for each in engines]
+        seeds = sorted(set.intersection(*driven))
         own = [ended[robot, engine][seed] for seed in seeds]
         success = [row["result"] == "success" for row in own]
         hits = sum(row["result"] == "collision" for row in own)
@@ -287,18 +280,14 @@ def judge(result: Result) -> list[str]:
     missed = []
     for robot, engines in result["engines"].items():
         for engine, told in engines.items():
-            who = f"{robot} in {engine}: "
-            figures = {
-                "collision": told["collision"]["value"],
-                "success": told["success"]["value"],
-            }
+            figures = {name: told[name]["value"] for name in ("collision", "success")}
             bars = {"collision": COLLISIONS}
             if engine == FAST:
                 bars["success"] = FAST_SUCCESS
             elif "points" in told:
                 figures["points"] = abs(told["points"])
                 bars["points"] = APART
-            missed += missed_bars(figures, bars, who)
+            missed += missed_bars(figures, bars, f"{robot} in {engine}: ")
     return missed
 
 

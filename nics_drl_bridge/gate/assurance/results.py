@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from nics_drl_bridge.confidence import bound_rate
@@ -78,21 +78,29 @@ def _list_failed(row: Row) -> list[str]:
 
 def find_clusters(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Returns the failures by claim, driver or fault, and place, the largest cluster first."""
-    seeds = defaultdict[tuple[Any, ...], list[int]](list)
+    failed: list[tuple[tuple[Any, ...], int]] = []
     for row in rows:
-        for claim in _list_failed(row):
-            near = [CELL_M * round(value / CELL_M) for value in row.get("position", ())]
-            cluster = (claim, row["kind"], row.get("world", ""), tuple(near))
-            seeds[cluster].append(row["seed"])
-    ordered = sorted(seeds.items(), key=lambda item: (-len(item[1]), item[0]))
+        near = [CELL_M * round(value / CELL_M) for value in row.get("position", ())]
+        place = (row["kind"], row.get("world", ""), tuple(near))
+        failed += [((claim, *place), row["seed"]) for claim in _list_failed(row)]
     return [
         {
             "claim": claim,
             "kind": kind,
             "world": world,
             "near": near,
-            "failures": len(of_cluster),
-            "seeds": of_cluster,
+            "failures": len(seeds),
+            "seeds": seeds,
         }
-        for (claim, kind, world, near), of_cluster in ordered
+        for (claim, kind, world, near), seeds in cluster_seeds(failed)
     ]
+
+
+def cluster_seeds(
+    failed: Iterable[tuple[tuple[Any, ...], int]],
+) -> list[tuple[tuple[Any, ...], list[int]]]:
+    """Collects the seeds of failures by their cluster; returns the largest cluster first."""
+    seeds = defaultdict[tuple[Any, ...], list[int]](list)
+    for cluster, seed in failed:
+        seeds[cluster].append(seed)
+    return sorted(seeds.items(), key=lambda item: (-len(item[1]), item[0]))

@@ -27,7 +27,9 @@ class Adam:
         """Takes one step at a learning rate."""
         self.steps += 1
         norm = float(np.linalg.norm(self.gradients))
-        gradients = self.gradients * np.float32(GRADIENT_LIMIT / max(norm, GRADIENT_LIMIT))
+        gradients = self.gradients * np.float32(
+            GRADIENT_LIMIT / max(norm, GRADIENT_LIMIT)
+        )
         self.mean += np.float32(1.0 - MEAN_DECAY) * (gradients - self.mean)
         self.square += np.float32(1.0 - SQUARE_DECAY) * (gradients**2 - self.square)
         unbiased = np.sqrt(self.square / np.float32(1.0 - SQUARE_DECAY**self.steps))

@@ -15,6 +15,7 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.kernels import COMPILING
@@ -28,9 +29,8 @@ ROOM = 4 * 2**30
 """Address space that a process may take besides what it has, so that the machine survives."""
 EXIT_BAD_INPUT = 2
 
-PROGRESS = re.compile(
-    r"^[a-z][\w ]* \(\d+ s\)\n", re.MULTILINE
-)  # where a step takes long
+# where a step takes long
+PROGRESS = re.compile(r"^[a-z][\w ]* \(\d+ s\)\n", re.MULTILINE)
 
 
 class ReadOtherwiseError(Exception):
@@ -39,40 +39,26 @@ class ReadOtherwiseError(Exception):
 
 @dataclass(frozen=True)
 class Attempt:
-    """What is handed to whom.
+    """What is handed to whom."""
 
-    Attributes:
-        kind: of input, as `policy`.
-        told: what is wrong with it, in words that reproduce it.
-        act: hands it over; raises what the entry point raises.
-        verdict: `bad` if it has to be refused, `good` if it has to be taken, `same` if it has to be
-            refused or read as it was, `any` if it may be refused or taken.
-    """
-
-    kind: str
-    told: str
-    act: Callable[[], object]
+    kind: str  # of input, as `policy`
+    told: str  # what is wrong with it, in words that reproduce it
+    act: Callable[[], object]  # hands it over; raises what the entry point raises
+    # `bad` if it has to be refused, `good` if it has to be taken, `same` if it has to be refused
+    # or read as it was, `any` if it may be refused or taken
     verdict: str = "bad"
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What came of an attempt.
+class Outcome(NamedTuple):
+    """What came of an attempt."""
 
-    Attributes:
-        end: `accepted`, `changed`, `refused`, `traceback`, or `hang`.
-        words: of the refusal or the traceback.
-        own_s: processor time that it took [s].
-        memory: that it took at its peak, beyond what the libraries had taken [bytes].
-    """
-
-    end: str
-    words: str
-    own_s: float
-    memory: int
+    end: str  # `accepted`, `changed`, `refused`, `traceback`, or `hang`
+    words: str  # of the refusal or the traceback
+    own_s: float  # processor time that it took
+    memory: int  # at its peak, beyond what the libraries had taken [bytes]
 
 
-def make(attempt: Attempt) -> Outcome:
+def make_attempt(attempt: Attempt) -> Outcome:
     """Makes an attempt in a forked process, which is killed when it takes too long."""
     reading, writing = os.pipe()
     begin = time.monotonic()
@@ -112,7 +98,7 @@ def _answer(attempt: Attempt, writing: int) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (size + ROOM, size + ROOM))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         compiled_s = COMPILING.cpu_s
-        end, words = _end_of(attempt.act)
+        end, words = _try(attempt.act)
         after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         told = end, words[:3000], (after - before) * 1024, COMPILING.cpu_s - compiled_s
         os.write(writing, pickle.dumps(told))
@@ -120,7 +106,7 @@ def _answer(attempt: Attempt, writing: int) -> None:
         os._exit(0)
 
 
-def _end_of(act: Callable[[], object]) -> tuple[str, str]:
+def _try(act: Callable[[], object]) -> tuple[str, str]:
     try:
         act()
     except ReadOtherwiseError:
@@ -136,8 +122,8 @@ def _end_of(act: Callable[[], object]) -> tuple[str, str]:
     return "accepted", ""
 
 
-def nics(folder: Path, *words: object) -> Callable[[], None]:
-    """An act: a command of `nics`. Raises BridgeError where it ends with its sentence."""
+def call_nics(folder: Path, *words: object) -> Callable[[], None]:
+    """Returns an act: a command of `nics`. It raises BridgeError for an end with a sentence."""
 
     def act() -> None:
         from nics_drl_bridge.commands.cli import main

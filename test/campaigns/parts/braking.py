@@ -9,8 +9,9 @@ import numpy as np
 from nics_drl_bridge.gate.footprint import get_body
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.gate.stopping import shield_config
-from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.generator import SimulatorModel, builtin_model
 from nics_drl_bridge.geometry import between
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 
@@ -18,54 +19,44 @@ SHARES = (1.0, 0.5, 0.25, 0.1)
 PERIODS = 15
 
 
-def braking_used(robot: str, given: Mapping[str, float] | None) -> float:
-    """The longest way of a robot to rest, in parts of what its shield keeps free for it.
+def measure_braking(robot: str, overrides: Mapping[str, float] | None) -> float:
+    """Returns the longest way of a robot to rest, in parts of what its shield keeps free for it.
 
     It drives straight at several speeds in each direction and lets go, at the worst moment: its
     base has just looked for a command, and looks again a control period later. One with an outline
-    turns on the spot as well.
-
-    Args:
-        robot: a shipped one.
-        given: values that go before those that are shipped; None for those.
+    turns on the spot as well. `overrides` replace values of the shipped shield.
     """
     model = builtin_model(robot)
     limits = load_limits(robot, model.robot)
-    shield, _ = shield_config(model, limits, robot, given)
-    sim = FastSimulator(model, load_world("empty"))
-    most = 0.0
+    shield, _ = shield_config(model, limits, robot, overrides)
     reach = get_body(shield).farthest_corner
-    for index, (low, high) in enumerate(zip(limits.low, limits.high, strict=True)):
-        arm = 1.0 if limits.linear[index] else reach * limits.turn[index]
-        if arm == 0.0:
-            continue
-        for speed in (
-            share * end for end in (low, high) if end != 0.0 for share in SHARES
-        ):
-            kept = abs(speed) * shield.latency_s + arm * speed**2 / (
-                2.0 * shield.deceleration
-            )
-            away = (
-                _stopping_distance(sim, index, speed)
-                + abs(speed) * model.control_period
-            )
-            most = max(most, away / kept)
-    return most
+    arms = np.where(limits.linear, 1.0, reach * limits.turn)
+    ends = np.concatenate([np.diag(limits.low), np.diag(limits.high)])
+    commands = np.concatenate([share * ends for share in SHARES])
+    commands = commands[(commands * arms).any(axis=1)]
+    away = _measure_stops(model, commands, limits.turn)
+    speeds = np.abs(commands.sum(axis=1))
+    braking = np.abs(commands) ** 2 @ arms / (2.0 * shield.deceleration)
+    kept = speeds * shield.latency_s + braking
+    return float(((away + speeds * model.control_period) / kept).max())
 
 
-def _stopping_distance(sim: FastSimulator, index: int, speed: float) -> float:
-    """How far from where the command was let go the robot comes [m], or turns on the spot [rad]."""
-    command = np.zeros((1, 1, len(sim.model.robot.command)))
-    sim.reset([0], starts=np.array([[[-2.0 * np.sign(speed), 0.0, 0.0]]]))
-    command[..., index] = speed
+def _measure_stops(model: SimulatorModel, commands: Array, turns: Array) -> Array:
+    """Returns how far from where the commands (N, C) were let go the robot comes [m], or turns."""
+    count = len(commands)
+    simulator = FastSimulator(model, load_world("empty"), count)
+    starts = np.zeros((count, 1, 3))
+    starts[:, 0, 0] = -2.0 * np.sign(commands.sum(axis=1))
+    simulator.reset(np.zeros(count, np.int64), starts=starts)
     for _ in range(PERIODS):
-        sim.step(command)
-    let_go = sim.data.pose[0, 0].copy()
-    furthest = 0.0
-    turns = bool(load_limits(sim.model.robot.name, sim.model.robot).turn[index])
+        simulator.step(commands[:, None])
+    pose = simulator.data.pose[:, 0]
+    let_go = pose.copy()
+    furthest = np.zeros(count)
     for _ in range(PERIODS):
-        sim.step(0.0 * command)
+        simulator.step(0.0 * commands[:, None])
         # Not the length of its track, which grows by the noise of a robot at rest.
-        x, y, angle = np.abs(between(let_go, sim.data.pose[0, 0]))
-        furthest = max(furthest, float(angle if turns else np.hypot(x, y)))
+        x, y, angle = np.abs(between(let_go, pose)).T
+        is_turn = (commands != 0.0) @ turns
+        furthest = np.maximum(furthest, np.where(is_turn, angle, np.hypot(x, y)))
     return furthest

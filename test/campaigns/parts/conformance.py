@@ -6,17 +6,14 @@ that asks for it, has to be answered as unsupported.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rosgraph_msgs.msg import Clock
+from geometry_msgs.msg import PoseStamped
 from simulation_interfaces import msg, srv
 
 from nics_drl_bridge.extras.simulation_interfaces.server import snake_case
-from nics_drl_bridge.nodes.listener import open_context
+from nics_drl_bridge.nodes.spun_node import SpunNode
 
 OK = msg.Result.RESULT_OK
 UNSUPPORTED = msg.Result.RESULT_FEATURE_UNSUPPORTED
@@ -28,7 +25,7 @@ PATIENCE_S = 300.0
 IDLE_S = 10.0
 
 
-class Client:
+class Client(SpunNode):
     """Calls the services of a simulator, as anybody's client would.
 
     One that is `idle` takes all that it asks for as done, while nothing is.
@@ -37,44 +34,17 @@ class Client:
     idle = False
 
     def __init__(self, domain_id: int | None = None, prefix: str = "") -> None:
-        self.context = open_context(domain_id=domain_id)
-        self.node = Node(
-            "conformance", context=self.context, start_parameter_services=False
-        )
-        self._executor = SingleThreadedExecutor(context=self.context)
-        self._executor.add_node(self.node)
-        self._clients: dict[str, Any] = {}
+        super().__init__("conformance", domain_id)
         self._prefix = f"{prefix}/" if prefix else ""
-        self.clock: list[Any] = []
-        self.node.create_subscription(Clock, "/clock", self.clock.append, 10)
-
-    def until(self, holds: Callable[[], Any], what: str) -> None:
-        """Spins until a condition holds. Raises TimeoutError."""
-        patience_s = IDLE_S if self.idle else PATIENCE_S
-        deadline = time.monotonic() + patience_s
-        while not holds():
-            if time.monotonic() > deadline:
-                raise TimeoutError(f"not within {patience_s:g} s: {what}")
-            self._executor.spin_once(timeout_sec=0.05)
-
-    def wait(self, future: Any, what: str) -> Any:
-        """Returns the result of a future. Raises TimeoutError."""
-        self.until(future.done, what)
-        return future.result()
 
     def __call__(self, name: str, /, **fields: Any) -> Any:
-        """Returns the response of a service, by the name of its type."""
+        """Returns the response of a service, by the name of its type. Raises TimeoutError."""
         kind = getattr(srv, name)
         if self.idle and not name.startswith("Get"):
             return kind.Response(result=msg.Result(result=OK))
-        if name not in self._clients:
-            topic = f"{self._prefix}{snake_case(name)}"
-            self._clients[name] = self.node.create_client(kind, topic)
-        client = self._clients[name]
-        self.until(client.service_is_ready, f"the service of {name}")
-        return self.wait(
-            client.call_async(kind.Request(**fields)), f"an answer of {name}"
-        )
+        patience_s = IDLE_S if self.idle else PATIENCE_S
+        service = f"{self._prefix}{snake_case(name)}"
+        return self.call_service(kind, service, patience_s, kind.Request(**fields))
 
     def code(self, name: str, /, **fields: Any) -> int:
         """Returns the result of a service."""
@@ -94,34 +64,17 @@ class Client:
         return list(self("GetEntities", filters=msg.EntityFilters(**filters)).entities)
 
     def spawn(self, name: str, x: float = 0.0, /, **fields: Any) -> Any:
-        """Spawns a disc; returns the response."""
-        request = spawn_request(name, x, **fields)
-        given = {
-            field: getattr(request, field)
-            for field in request.get_fields_and_field_types()
-        }
-        return self("SpawnEntity", **given)
+        """Spawns a disc at x [m], or what else the fields say; returns the response."""
+        pose = PoseStamped()
+        pose.pose.position.x = x
+        disc = msg.Resource(resource_string=SHAPE)
+        about = {"name": name, "entity_resource": disc, "initial_pose": pose}
+        return self("SpawnEntity", **about | fields)
 
     def start(self) -> None:
         """Brings the simulator back to where it began, paused."""
         self("ResetSimulation", scope=0)
         self.set_state(STATES.STATE_PAUSED)
-
-    def close(self) -> None:
-        """Ends the client."""
-        self._executor.shutdown(timeout_sec=1.0)
-        self.node.destroy_node()
-        self.context.try_shutdown()
-
-
-def spawn_request(name: str, x: float = 0.0, /, **fields: Any) -> Any:
-    """Returns the request of a disc at x [m], or of what else the fields say."""
-    request = msg.SpawnEntity(name=name)
-    request.entity_resource.resource_string = SHAPE
-    request.initial_pose.pose.position.x = x
-    for field, value in fields.items():
-        setattr(request, field, value)
-    return request
 
 
 def _spawns_and_deletes(c: Client) -> bool:
@@ -319,7 +272,7 @@ SERVICES = {
 }
 
 
-def features() -> dict[str, int]:
+def list_features() -> dict[str, int]:
     """Returns all features of the standard by their names."""
     kinds = msg.SimulatorFeatures
     found = {name: getattr(kinds, name) for name in dir(type(kinds)) if name.isupper()}
@@ -329,7 +282,7 @@ def features() -> dict[str, int]:
 def announced(client: Client) -> set[str]:
     """Returns the names of the features that a simulator announces."""
     told = set(client("GetSimulatorFeatures").features.features)
-    return {name for name, number in features().items() if number in told}
+    return {name for name, number in list_features().items() if number in told}
 
 
 def failures(client: Client, world: str, told: set[str] | None = None) -> list[str]:
@@ -342,7 +295,7 @@ def failures(client: Client, world: str, told: set[str] | None = None) -> list[s
     """
     told = announced(client) if told is None else told
     failed = []
-    for name in features():
+    for name in list_features():
         if name in told and name in CHECKS:
             client("LoadWorld", world_resource=msg.Resource(uri=world))
             client.start()

@@ -9,34 +9,23 @@ from typing import Any
 
 from bad_files import FILES, TEXTS
 from hypothesis import strategies as st
-from parts.attempt import Attempt, ReadOtherwiseError, nics
-from parts.loaders import LOADERS, Loader, tree_of
+from parts.attempt import Attempt, ReadOtherwiseError, call_nics
+from parts.loaders import LOADERS, Loader, find_tree
 
+TEXTS_IN_PLACE = ("word", "x" * 5000, "../../etc/passwd", "a\nb\x1b[2J")
+TREES_IN_PLACE = ([], {}, [[[1]]], [1.0] * 5000, {"a": {"b": 1}})
 values = st.one_of(
     st.none(),
     st.booleans(),
     st.integers(-2, 2),
     st.integers(2**62, 2**80),
     st.floats(),
-    st.sampled_from(
-        (
-            "word",
-            "x" * 5000,
-            "../../etc/passwd",
-            "a\nb\x1b[2J",
-            [],
-            {},
-            [[[1]]],
-            [1.0] * 5000,
-            10**400,
-            {"a": {"b": 1}},
-        )
-    ),
+    st.sampled_from((*TEXTS_IN_PLACE, *TREES_IN_PLACE, 10**400)),
 )
 
 
 @st.composite
-def changed_bytes(draw: st.DrawFn, whole: bytes) -> bytes:
+def change_bytes(draw: st.DrawFn, whole: bytes) -> bytes:
     """Bytes that were cut, flipped, replaced or inserted."""
     data = bytearray(whole)
     place = draw(st.integers(0, len(data) - 1))
@@ -56,7 +45,7 @@ def changed_bytes(draw: st.DrawFn, whole: bytes) -> bytes:
 
 
 @st.composite
-def changed_tree(draw: st.DrawFn, tree: Any) -> str:
+def change_tree(draw: st.DrawFn, tree: Any) -> str:
     """Replaces a value somewhere in nested mappings and lists; returns its place."""
     place = []
     inner = tree
@@ -76,7 +65,7 @@ def changed_tree(draw: st.DrawFn, tree: Any) -> str:
 
 
 @st.composite
-def attempts(draw: st.DrawFn, wholes: dict[str, Any], folder: Path) -> Attempt:
+def draw_attempts(draw: st.DrawFn, wholes: dict[str, Any], folder: Path) -> Attempt:
     """An input of any kind, whole or damaged, and what reads it.
 
     Args:
@@ -91,23 +80,21 @@ def attempts(draw: st.DrawFn, wholes: dict[str, Any], folder: Path) -> Attempt:
     path = folder / source.name
     ways: list[Callable[..., tuple[str, str]]] = [_spare, _change_bytes]
     ways += [_replace] * path.is_file()
-    ways += [_blow_up] * bool(loader.bombs)
     ways += [_retell] * bool(loader.text)
-    ways += [_change_value] * (tree_of(loader) is not None)
+    ways += [_change_value] * (find_tree(loader) is not None)
     way = draw(st.sampled_from(ways))
     told, verdict = way(draw, loader, path)
-    act: Callable[[], object] = lambda: _read(loader, path, content)  # noqa: E731
-    if verdict in ("any", "good"):
-        act = lambda: loader.read(path)  # noqa: E731
-    elif verdict == "bad" and loader.command and draw(st.integers(0, 4)) == 0:
-        act = nics(folder, *loader.command, path)
+
+    def read() -> None:
+        found = loader.read(path)
+        is_checked = verdict in ("same", "bad")
+        if is_checked and (loader.sealed or found != content):
+            raise ReadOtherwiseError
+
+    act: Callable[[], object] = read
+    if verdict == "bad" and loader.command and draw(st.integers(0, 4)) == 0:
+        act = call_nics(folder, *loader.command, path)
     return Attempt(loader.name, told, act, verdict)
-
-
-def _read(loader: Loader, path: Path, content: object) -> None:
-    found = loader.read(path)
-    if loader.sealed or found != content:
-        raise ReadOtherwiseError
 
 
 def _spare(draw: st.DrawFn, loader: Loader, path: Path) -> tuple[str, str]:
@@ -117,7 +104,7 @@ def _spare(draw: st.DrawFn, loader: Loader, path: Path) -> tuple[str, str]:
 def _change_bytes(draw: st.DrawFn, loader: Loader, path: Path) -> tuple[str, str]:
     files = sorted(file for file in path.rglob("*") if file.is_file()) or [path]
     file = draw(st.sampled_from(files))
-    file.write_bytes(draw(changed_bytes(file.read_bytes())))
+    file.write_bytes(draw(change_bytes(file.read_bytes())))
     return f"bytes of {file.name}", "any" if loader.free else "same"
 
 
@@ -134,13 +121,6 @@ def _replace(draw: st.DrawFn, loader: Loader, path: Path) -> tuple[str, str]:
     return damage, "bad"
 
 
-def _blow_up(draw: st.DrawFn, loader: Loader, path: Path) -> tuple[str, str]:
-    name = draw(st.sampled_from(sorted(loader.bombs)))
-    size = draw(st.integers(1, 8))
-    loader.bombs[name](path, size)
-    return f"{name}, {size}", "bad"
-
-
 def _retell(draw: st.DrawFn, loader: Loader, path: Path) -> tuple[str, str]:
     name = draw(st.sampled_from(sorted(TEXTS)))
     TEXTS[name](path / loader.text)
@@ -149,10 +129,10 @@ def _retell(draw: st.DrawFn, loader: Loader, path: Path) -> tuple[str, str]:
 
 
 def _change_value(draw: st.DrawFn, loader: Loader, path: Path) -> tuple[str, str]:
-    tree = tree_of(loader)
+    tree = find_tree(loader)
     assert tree is not None
     open_tree, save_tree = tree
     data = open_tree(path)
-    told = draw(changed_tree(data))
+    told = draw(change_tree(data))
     save_tree(path, data)
     return told, "any" if loader.sealed else "same"

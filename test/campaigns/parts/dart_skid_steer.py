@@ -1,9 +1,9 @@
 """A skid-steer robot in DART, Gazebo's physics engine, behind the topics of an ordinary driver.
 
-The extra `dart` builds the place. Nothing here uses this package's kinematics or lidar: four wheels
-roll and slip by DART's contacts, and the lidar is an analytic ray cast. The wheels turn the robot
-less than the driver's odometry believes, because the driver computes with one effective track. A
-gyro measures the true turn rate, with noise and a constant bias.
+The extra `dart` builds the place and casts the lidar's rays. Nothing here uses this package's
+kinematics: four wheels roll and slip by DART's contacts. The wheels turn the robot less than the
+driver's odometry believes, because the driver computes with one effective track. A gyro measures
+the true turn rate, with noise and a constant bias.
 
 Subscribes to `cmd_vel` (TwistStamped), publishes `odom`, `scan`, `imu` and, for the judge alone,
 `true_pose` and `touched`. `hold` (Bool) fixes the body to the ground while its wheels go on.
@@ -11,28 +11,24 @@ Subscribes to `cmd_vel` (TwistStamped), publishes `odom`, `scan`, `imu` and, for
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-from dataclasses import dataclass
-from pathlib import Path
+import time
+from collections.abc import Sequence
+from typing import Any
 
 import dartpy
 import numpy as np
-import rclpy
-from geometry_msgs.msg import PoseStamped, TwistStamped
+from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
-from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu, LaserScan
 from std_msgs.msg import Bool
 
 from nics_drl_bridge.extras.dart import scenery
 from nics_drl_bridge.extras.physics.scenery import Box, Cylinder
-
-Array = NDArray[np.float64]
+from nics_drl_bridge.interface import NS_PER_S, Array
+from nics_drl_bridge.lidar.spec import load_lidar
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.spun_node import SpunNode
 
 STEP_S = 0.002
 WHEEL_RADIUS = 0.165  # [m]
@@ -44,85 +40,22 @@ MOTOR_TORQUE = 80.0  # [N m]
 WHEEL_ACCELERATION = 12.0  # [rad/s^2]
 BODY = (0.9, 0.4, 0.2)  # [m]
 THICK = 0.2  # of walls [m]
-BELIEVED_TRACK = (
-    1.35 * TRACK
-)  # by which the driver converts wheel speeds and turn rates
+LEVEL = 0.5  # of the lidar, and of the middle of walls and pillars [m]
+# by which the driver converts wheel speeds and turn rates
+BELIEVED_TRACK = 1.35 * TRACK
 COMMAND_TIMEOUT_S = 0.5
+ODOM_HZ = 20
+IMU_HZ = 50
+SCAN_HZ = 10
+GYRO_BIAS = 0.01  # [rad/s]
+GYRO_NOISE = 0.005  # [rad/s]
+RANGE_NOISE = 0.005  # standard deviation as a fraction of a range
+LIDAR = load_lidar("rplidar_a2")
+FRAMES = ("odom", "base_link")
+VARIANCES = (0.001, 0.03, 0.001, 0.03)
 
 
-@dataclass(frozen=True)
-class Place:
-    """What stands around the robot.
-
-    Attributes:
-        size: of the walls around the middle (2,) [m].
-        pillars: x, y, radius of each (P, 3) [m].
-    """
-
-    size: Array
-    pillars: Array
-
-    @classmethod
-    def read(cls, file: Path) -> Place:
-        """Reads a JSON file with `size` and `pillars`."""
-        content = json.loads(file.read_text(encoding="utf-8"))
-        pillars = np.array(content["pillars"], dtype=float).reshape(-1, 3)
-        return cls(np.array(content["size"], dtype=float), pillars)
-
-
-@dataclass(frozen=True)
-class Lidar:
-    """A lidar that sees all around, by default with the figures of an RPLIDAR A2."""
-
-    beams: int = 800
-    range_min: float = 0.15
-    range_max: float = 12.0
-    noise: float = 0.005  # standard deviation as a fraction of a range
-
-    @property
-    def angles(self) -> Array:
-        """Of the beams, seen from the lidar (B,) [rad]."""
-        return -math.pi + self.angle_increment * np.arange(self.beams)
-
-    @property
-    def angle_increment(self) -> float:
-        """Between two beams [rad]."""
-        return 2.0 * math.pi / self.beams
-
-    def scan(self, place: Place, pose: Array, rng: np.random.Generator) -> Array:
-        """Returns the ranges (B,) [m] from a pose (3,) of the lidar; inf where nothing is hit."""
-        directions = pose[2] + self.angles
-        rays = np.stack([np.cos(directions), np.sin(directions)], axis=1)
-        ranges = np.minimum(
-            _range_of_walls(place, pose, rays), _range_of_pillars(place, pose, rays)
-        )
-        ranges *= 1.0 + rng.normal(0.0, self.noise, self.beams)
-        return np.where(
-            (ranges > self.range_min) & (ranges < self.range_max), ranges, np.inf
-        )
-
-
-def _range_of_walls(place: Place, pose: Array, rays: Array) -> Array:
-    """Returns the distance to the walls, from within them (B,) [m]."""
-    ahead = np.where(rays > 0.0, 0.5 * place.size, -0.5 * place.size) - pose[:2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(rays == 0.0, np.inf, ahead / rays).min(axis=1)
-
-
-def _range_of_pillars(place: Place, pose: Array, rays: Array) -> Array:
-    """Returns the distance to the nearest pillar on each ray (B,) [m]."""
-    if len(place.pillars) == 0:
-        return np.full(len(rays), np.inf)
-    to_middle = place.pillars[:, :2] - pose[:2]
-    along = rays @ to_middle.T
-    squared = np.sum(to_middle**2, axis=1) - along**2
-    chord_squared = place.pillars[:, 2] ** 2 - squared
-    hit = (chord_squared > 0.0) & (along > 0.0)
-    entry = along - np.sqrt(np.maximum(chord_squared, 0.0))
-    return np.where(hit, entry, np.inf).min(axis=1)
-
-
-def _wheel_urdf(name: str) -> str:
+def _write_wheel(name: str) -> str:
     side = 1 if name.endswith("left") else -1
     end = 1 if name.startswith("front") else -1
     origin = f"{end * 0.5 * WHEELBASE} {side * 0.5 * TRACK} {WHEEL_RADIUS}"
@@ -139,7 +72,7 @@ def _wheel_urdf(name: str) -> str:
     </joint>"""
 
 
-def robot_urdf() -> str:
+def write_robot() -> str:
     """Returns the URDF of the robot: a box on four wheels."""
     size = " ".join(str(side) for side in BODY)
     return f"""<robot name="skid_steer">
@@ -147,14 +80,16 @@ def robot_urdf() -> str:
       <inertial><origin xyz="0 0 0.2"/><mass value="38"/>
         <inertia ixx="0.6" iyy="1.4" izz="1.7" ixy="0" ixz="0" iyz="0"/></inertial>
       <collision><origin xyz="0 0 0.25"/><geometry><box size="{size}"/></geometry></collision>
-    </link>{"".join(_wheel_urdf(name) for name in WHEELS)}
+    </link>{"".join(_write_wheel(name) for name in WHEELS)}
     </robot>"""
 
 
 class Engine:
-    """The world of DART with the robot in a place."""
+    """The world of DART with the robot between walls (2,) [m] and pillars x, y, radius (P, 3)."""
 
-    def __init__(self, place: Place, pose: Array) -> None:
+    def __init__(
+        self, size: Sequence[float], pillars: Sequence[Any], pose: Sequence[float]
+    ) -> None:
         self.world = dartpy.simulation.World()
         self.world.setTimeStep(STEP_S)
         self.world.setCollisionDetector(dartpy.simulation.CollisionDetectorType.ODE)
@@ -162,43 +97,42 @@ class Engine:
         slab = dartpy.dynamics.BoxShape([80.0, 80.0, 0.2])
         below = scenery.make_transform(dartpy, [0.0, 0.0, -0.1])
         scenery.let_touch(scenery.add_shape(ground, slab, below), friction=1.0)
-        self._add_walls(place)
-        self._robot = dartpy.utils.DartLoader().parseSkeletonString(robot_urdf(), "")
+        self._seen = scenery.make_group(dartpy, self._add_walls(size, pillars))
+        self._robot = dartpy.utils.DartLoader().parseSkeletonString(write_robot(), "")
         self._base = self._robot.getBodyNode("base_link")
         self._prepare_wheels()
-        scenery.place_body(self._base, pose)
+        scenery.place_body(self._base, np.array(pose))
         self.world.addSkeleton(self._robot)
         self._weld: dartpy.constraint.WeldJointConstraint | None = None
         self.wheel_speeds = np.zeros(4)  # asked of the motors [rad/s]
 
-    def _add_walls(self, place: Place) -> None:
+    def _add_walls(self, size: Sequence[float], pillars: Sequence[Any]) -> list[Any]:
         body = scenery.add_fixed_body(dartpy, self.world, "walls")
-        length, width = place.size + THICK
-        for sign in (-1, 1):
-            beside = Box(np.array([0.0, sign * 0.5 * width]), 0.0, (length, THICK))
-            ahead = Box(np.array([sign * 0.5 * length, 0.0]), 0.0, (THICK, width))
-            for wall in (beside, ahead):
-                scenery.add_solid(dartpy, body, wall, level=0.5, height=1.0)
-        for x, y, radius in place.pillars:
-            pose = np.array([x, y, 0.0])
-            scenery.add_solid(
-                dartpy, body, Cylinder(radius), level=0.5, height=1.0, pose=pose
-            )
+        length, width = np.array(size) + THICK
+        solids: list[tuple[Any, Array]] = []
+        for sign in (-0.5, 0.5):
+            beside = Box(np.array([0.0, sign * width]), 0.0, (length, THICK))
+            ahead = Box(np.array([sign * length, 0.0]), 0.0, (THICK, width))
+            solids += [(wall, scenery.ORIGIN) for wall in (beside, ahead)]
+        for x, y, radius in pillars:
+            solids.append((Cylinder(radius), np.array([x, y, 0.0])))
+        return [
+            scenery.add_solid(dartpy, body, solid, LEVEL, height=1.0, pose=pose)
+            for solid, pose in solids
+        ]
 
     def _prepare_wheels(self) -> None:
-        names = [degree.getName() for degree in self._robot.getDofs()]
-        self._wheels = [names.index(f"{name}_joint") for name in WHEELS]
-        for name, index in zip(WHEELS, self._wheels, strict=True):
-            joint = self._robot.getJoint(f"{name}_joint")
+        joints = [self._robot.getJoint(f"{name}_joint") for name in WHEELS]
+        self._wheels = [joint.getIndexInSkeleton(0) for joint in joints]
+        for joint, index in zip(joints, self._wheels, strict=True):
             joint.setActuatorType(dartpy.dynamics.ActuatorType.SERVO)
             self._robot.getDof(index).setForceLimits(-MOTOR_TORQUE, MOTOR_TORQUE)
-            for node in self._robot.getBodyNode(name).getShapeNodes():
+            for node in joint.getChildBodyNode().getShapeNodes():
                 node.getDynamicsAspect().setFrictionCoeff(FRICTION)
 
     def step(self) -> None:
         """Moves the world by one step."""
-        for index, speed in zip(self._wheels, self.wheel_speeds, strict=True):
-            self._robot.setCommand(index, float(speed))
+        self._robot.setCommands(self._wheels, self.wheel_speeds)
         self.world.step()
 
     def hold(self, held: bool) -> None:
@@ -232,204 +166,121 @@ class Engine:
     @property
     def measured_wheel_speeds(self) -> Array:
         """Of the encoders (4,) [rad/s]."""
-        return np.array([self._robot.getVelocity(index) for index in self._wheels])
+        return np.array(self._robot.getVelocities(self._wheels))
 
     @property
     def touches(self) -> bool:
-        """Whether the robot touches something other than the ground."""
+        """True if the robot touches something other than the ground."""
         for contact in self.world.getLastCollisionResult().getContacts():
-            names = {
-                contact.collisionObject1.getShapeFrame()
-                .asShapeNode()
-                .getSkeleton()
-                .getName(),
-                contact.collisionObject2.getShapeFrame()
-                .asShapeNode()
-                .getSkeleton()
-                .getName(),
-            }
-            if "skid_steer" in names and "ground" not in names and len(names) == 2:
+            pair = (contact.collisionObject1, contact.collisionObject2)
+            nodes = [one.getShapeFrame().asShapeNode() for one in pair]
+            if {node.getSkeleton().getName() for node in nodes} == {
+                "skid_steer",
+                "walls",
+            }:
                 return True
         return False
 
+    def cast_scan(self) -> Array:
+        """Returns the ranges (B,) [m] of the lidar, without noise."""
+        return scenery.cast_scan(dartpy, self._seen, LIDAR, self.pose, LEVEL)
 
-class Driver(Node):
+
+class Driver(SpunNode):
     """The topics of the robot, in real time."""
 
-    ODOM_HZ = 20
-    IMU_HZ = 50
-    SCAN_HZ = 10
-    GYRO_BIAS = 0.01  # [rad/s]
-    GYRO_NOISE = 0.005  # [rad/s]
-
-    def __init__(self, place: Place, pose: Array, seed: int, imu: bool) -> None:
+    def __init__(self, engine: Engine, seed: int, has_imu: bool) -> None:
         super().__init__("base_driver")
-        self.engine = Engine(place, pose)
-        self._place = place
-        self._lidar = Lidar()
+        self._engine = engine
         self._rng = np.random.default_rng(seed)
         self._odometry = np.zeros(3)
-        self._command = np.zeros(2)
+        self._command = np.zeros(3)
         self._command_time_s = -math.inf
         self._steps = 0
         self._touched = False
-        self._started_ns = self.get_clock().now().nanoseconds
-        self.create_subscription(TwistStamped, "cmd_vel", self._on_command, 1)
-        self.create_subscription(
-            Bool, "hold", lambda message: self.engine.hold(message.data), 10
+        self._started_ns = time.time_ns()
+        node = self.node
+        node.create_subscription(TwistStamped, "cmd_vel", self._take_command, 1)
+        node.create_subscription(
+            Bool, "hold", lambda message: engine.hold(message.data), 10
         )
-        self._odom = self.create_publisher(Odometry, "odom", 10)
-        self._scan = self.create_publisher(LaserScan, "scan", qos_profile_sensor_data)
-        self._imu = (
-            self.create_publisher(Imu, "imu", qos_profile_sensor_data) if imu else None
-        )
-        self._true_pose = self.create_publisher(PoseStamped, "true_pose", 10)
-        self._touch = self.create_publisher(Bool, "touched", 10)
-        self.create_timer(0.01, self._run)
+        self._odom = node.create_publisher(Odometry, "odom", 10)
+        self._scan = node.create_publisher(LaserScan, "scan", qos.SENSOR)
+        self._imu = node.create_publisher(Imu, "imu", qos.SENSOR) if has_imu else None
+        self._truth = node.create_publisher(Odometry, "true_pose", 10)
+        self._touch = node.create_publisher(Bool, "touched", 10)
 
-    def _on_command(self, message: TwistStamped) -> None:
-        self._command = np.array([message.twist.linear.x, message.twist.angular.z])
-        self._command_time_s = self.engine.time_s
+    def _take_command(self, message: TwistStamped) -> None:
+        self._command = conversions.twist_from_ros(message)
+        self._command_time_s = self._engine.time_s
 
-    def _run(self) -> None:
+    def catch_up(self) -> None:
         """Catches up with the clock, and publishes what has become due."""
-        elapsed_s = 1e-9 * (self.get_clock().now().nanoseconds - self._started_ns)
-        while self.engine.time_s + STEP_S <= elapsed_s:
+        elapsed_s = (time.time_ns() - self._started_ns) / NS_PER_S
+        while self._engine.time_s + STEP_S <= elapsed_s:
             self._drive_wheels()
-            self.engine.step()
+            self._engine.step()
             self._steps += 1
-            self._integrate_odometry()
-            if self._is_due(self.IMU_HZ) and self._imu is not None:
+            forward, turn = self._measure_twist()
+            heading = self._odometry[2] + 0.5 * turn * STEP_S
+            way = [math.cos(heading) * forward, math.sin(heading) * forward, turn]
+            self._odometry += STEP_S * np.array(way)
+            if self._is_due(IMU_HZ) and self._imu is not None:
                 self._publish_imu()
-            if self._is_due(self.ODOM_HZ):
-                self._publish_odometry()
-            if self._is_due(self.SCAN_HZ):
-                self._publish_scan()
+            if self._is_due(ODOM_HZ):
+                self._publish_odometry([forward, 0.0, turn])
+            if self._is_due(SCAN_HZ):
+                ranges = self._engine.cast_scan()
+                ranges *= 1.0 + self._rng.normal(0.0, RANGE_NOISE, LIDAR.beams)
+                ranges = ranges.astype(np.float32)
+                scan = conversions.scan_to_ros(LIDAR, ranges, self._stamp_ns, "laser")
+                self._scan.publish(scan)
 
     def _is_due(self, rate_hz: int) -> bool:
         return self._steps % round(1.0 / (STEP_S * rate_hz)) == 0
 
     def _drive_wheels(self) -> None:
-        forward, turn = self._command
-        if self.engine.time_s - self._command_time_s > COMMAND_TIMEOUT_S:
-            forward = 0.0
-            turn = 0.0
+        forward, _, turn = self._command
+        if self._engine.time_s - self._command_time_s > COMMAND_TIMEOUT_S:
+            forward = turn = 0.0
         left = (forward - 0.5 * BELIEVED_TRACK * turn) / WHEEL_RADIUS
         right = (forward + 0.5 * BELIEVED_TRACK * turn) / WHEEL_RADIUS
-        wanted = np.array([left, right, left, right])
+        missing = np.array([left, right, left, right]) - self._engine.wheel_speeds
         change = WHEEL_ACCELERATION * STEP_S
-        self.engine.wheel_speeds += np.clip(
-            wanted - self.engine.wheel_speeds, -change, change
-        )
+        self._engine.wheel_speeds += np.clip(missing, -change, change)
 
-    def _odometry_twist(self) -> tuple[float, float]:
-        speeds = WHEEL_RADIUS * self.engine.measured_wheel_speeds
-        left = 0.5 * (speeds[0] + speeds[2])
-        right = 0.5 * (speeds[1] + speeds[3])
+    def _measure_twist(self) -> tuple[float, float]:
+        """Returns speed and turn rate as the driver believes them by its encoders."""
+        speeds = WHEEL_RADIUS * self._engine.measured_wheel_speeds
+        left, right = 0.5 * (speeds[:2] + speeds[2:])
         return 0.5 * (left + right), (right - left) / BELIEVED_TRACK
 
-    def _integrate_odometry(self) -> None:
-        forward, turn = self._odometry_twist()
-        heading = self._odometry[2] + 0.5 * turn * STEP_S
-        step = np.array(
-            [math.cos(heading) * forward, math.sin(heading) * forward, turn]
-        )
-        self._odometry += STEP_S * step
-
+    @property
     def _stamp_ns(self) -> int:
-        return self._started_ns + round(1e9 * self.engine.time_s)
+        return self._started_ns + round(NS_PER_S * self._engine.time_s)
 
-    def _set_stamp(self, header: object) -> None:
-        seconds, nanoseconds = divmod(self._stamp_ns(), 10**9)
-        header.stamp.sec = seconds  # type: ignore[attr-defined]
-        header.stamp.nanosec = nanoseconds  # type: ignore[attr-defined]
-
-    def _publish_odometry(self) -> None:
-        forward, turn = self._odometry_twist()
-        message = Odometry()
-        self._set_stamp(message.header)
-        message.header.frame_id = "odom"
-        message.child_frame_id = "base_link"
-        _fill_pose(message.pose.pose, self._odometry)
-        message.twist.twist.linear.x = forward
-        message.twist.twist.angular.z = turn
-        message.pose.covariance = _covariance(0.001, 0.03)
-        message.twist.covariance = _covariance(0.001, 0.03)
-        self._odom.publish(message)
-        truth = PoseStamped()
-        truth.header = message.header
-        _fill_pose(truth.pose, self.engine.pose)
-        self._true_pose.publish(truth)
-        self._touched |= self.engine.touches
+    def _publish_odometry(self, twist: Sequence[float]) -> None:
+        about = twist, self._stamp_ns, FRAMES, VARIANCES
+        self._odom.publish(conversions.odometry_to_ros(self._odometry, *about))
+        self._truth.publish(conversions.odometry_to_ros(self._engine.pose, *about))
+        self._touched |= self._engine.touches
         self._touch.publish(Bool(data=self._touched))
 
     def _publish_imu(self) -> None:
-        message = Imu()
-        self._set_stamp(message.header)
-        message.header.frame_id = "base_link"
-        noise = self._rng.normal(0.0, self.GYRO_NOISE)
-        message.angular_velocity.z = self.engine.turn_rate + self.GYRO_BIAS + noise
-        message.angular_velocity_covariance[8] = self.GYRO_NOISE**2
+        message = Imu(header=conversions.header_to_ros(self._stamp_ns, "base_link"))
+        noise = self._rng.normal(0.0, GYRO_NOISE)
+        message.angular_velocity.z = self._engine.turn_rate + GYRO_BIAS + noise
+        message.angular_velocity_covariance[8] = GYRO_NOISE**2
         message.linear_acceleration.z = 9.81
         message.orientation_covariance[0] = -1.0  # REP-145: it measures no orientation
         self._imu.publish(message)
 
-    def _publish_scan(self) -> None:
-        lidar = self._lidar
-        ranges = lidar.scan(self._place, self.engine.pose, self._rng)
-        message = LaserScan()
-        self._set_stamp(message.header)
-        message.header.frame_id = "laser"
-        message.angle_min = float(lidar.angles[0])
-        message.angle_max = float(lidar.angles[-1])
-        message.angle_increment = lidar.angle_increment
-        message.scan_time = 1.0 / self.SCAN_HZ
-        message.range_min = lidar.range_min
-        message.range_max = lidar.range_max
-        message.ranges = ranges.astype(np.float32).tolist()
-        self._scan.publish(message)
 
-
-def _fill_pose(pose: object, values: Array) -> None:
-    pose.position.x = float(values[0])  # type: ignore[attr-defined]
-    pose.position.y = float(values[1])  # type: ignore[attr-defined]
-    pose.orientation.z = math.sin(0.5 * values[2])  # type: ignore[attr-defined]
-    pose.orientation.w = math.cos(0.5 * values[2])  # type: ignore[attr-defined]
-
-
-def _covariance(linear: float, angular: float) -> list[float]:
-    """Returns a planar covariance (36,) by the variances of x, y and heading."""
-    values = np.zeros((6, 6))
-    for index in (0, 1):
-        values[index, index] = linear
-    for index in (2, 3, 4):
-        values[index, index] = 1e6
-    values[5, 5] = angular
-    return values.ravel().tolist()
-
-
-def main() -> None:
-    """Runs the driver until it is interrupted."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--place", type=Path, required=True, help="JSON: size, pillars")
-    parser.add_argument("--pose", type=float, nargs=3, default=(0.0, 0.0, 0.0))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--no-imu", action="store_true")
-    options = parser.parse_args()
-    rclpy.init()
-    driver = Driver(
-        Place.read(options.place),
-        np.array(options.pose),
-        options.seed,
-        not options.no_imu,
-    )
-    try:
-        rclpy.spin(driver)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        rclpy.try_shutdown()
-
-
-if __name__ == "__main__":
-    main()
+def run(
+    size: Sequence[float], pillars: Sequence[Any], seed: int, has_imu: bool
+) -> None:
+    """Runs the driver until it is killed."""
+    driver = Driver(Engine(size, pillars, [0.0, 0.0, 0.0]), seed, has_imu)
+    while True:
+        driver.spin(0.001)
+        driver.catch_up()

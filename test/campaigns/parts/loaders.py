@@ -6,33 +6,23 @@ import io
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import bags
 import numpy as np
 import onnx
-from parts.gates import gate_config
-from parts.growing import (
-    CSVS,
-    MAPS,
-    RECORDINGS,
-    TABLES,
-    WORLDS,
-    Bomb,
-    grow_boxes,
-    grow_checkpoints,
-    grow_policies,
-)
 
 from nics_drl_bridge.config import dump_yaml, parse_yaml, share_folder
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.extras.bags.info import read_bag_info
 from nics_drl_bridge.files import SUMS, hash_bytes, seal, write_bytes, write_sums
 from nics_drl_bridge.gate import black_box
+from nics_drl_bridge.gate.assurance.episodes import configure_gate
 from nics_drl_bridge.gate.gate_loop import Gate
 from nics_drl_bridge.gate.inputs import Tick
 from nics_drl_bridge.gate.limits import load_limits
@@ -71,37 +61,28 @@ TRAINING = {
 }
 
 
-def _leave(path: Path) -> None:
-    """Nothing has to fit."""
-
-
 @dataclass(frozen=True)
 class Loader:
-    """One kind of input.
+    """One kind of input."""
 
-    Attributes:
-        name: of the file or folder.
-        write: writes version 0 or 1 of a whole one to a path.
-        read: returns what tells a version from another. Raises BridgeError.
-        sealed: whether any changed byte has to be refused; otherwise what is read has to be whole.
-        text: the YAML file, if any: within the folder, or the file itself if `.`.
-        tree: opens and saves values that can be replaced; by default those of `text`.
-        reseal: makes checksums fit a changed text.
-        bombs: by name, what writes one that would take memory or time.
-        free: whether changed bytes may be read as anything.
-        command: words of `nics` before the path, of a command that reads it.
-    """
-
-    name: str
-    write: Callable[[Path, int], object]
+    name: str  # of the file or folder
+    write: Callable[
+        [Path, int], object
+    ]  # writes version 0 or 1 of a whole one to a path
+    # returns what tells a version from another; raises BridgeError
     read: Callable[[Path], object]
+    # True: any changed byte has to be refused; otherwise what is read has to be whole
     sealed: bool = True
+    # the YAML file, if any: within the folder, or the file itself if `.`
     text: str = ""
+    # opens and saves values that can be replaced; by default those of `text`
     tree: Tree | None = None
-    reseal: Callable[[Path], None] = _leave
-    bombs: Mapping[str, Bomb] = field(default_factory=dict)
-    free: bool = False
-    command: tuple[str, ...] = ()
+    # makes checksums fit a changed text
+    reseal: Callable[[Path], None] = lambda path: None
+    free: bool = False  # changed bytes may be read as anything
+    command: tuple[
+        str, ...
+    ] = ()  # of `nics` before the path, of a command that reads it
 
 
 # Recordings, models, tables, black boxes, policies and checkpoints: what the package writes.
@@ -147,13 +128,13 @@ def _write_table(path: Path, version: int) -> None:
 
 @lru_cache
 def _gate_entries(version: int) -> tuple[Any, tuple[black_box.Entry, ...]]:
-    lidar = load_lidar("paper")
-    config = gate_config(load_robot("differential"), lidar)
-    gate = Gate(config, lidar)
+    model = builtin_model("differential")
+    config = configure_gate(model, "differential", shielded=False)
+    gate = Gate(config, model.lidar)
     entries = []
     for _ in range((5, 9)[version]):
         before = gate.state
-        gate.now = gate.now + 0.02
+        gate.now += 0.02
         entries.append(black_box.Entry(gate.now, Tick(), before, gate.tick()))
     return config, tuple(entries)
 
@@ -218,7 +199,6 @@ WRITTEN = (
         lambda path, version: save_recording(_drive(version), path),
         lambda path: _hash(load_recording(path).pose.values),
         tree=(_open_meta, _save_meta),
-        bombs=RECORDINGS,
         command=("generate", "--robot", ROBOT, "--out", "generated"),
     ),
     Loader(
@@ -234,14 +214,12 @@ WRITTEN = (
         _write_table,
         lambda path: _hash(LidarTable.load(path).rows),
         reseal=write_sums,
-        bombs=TABLES,
     ),
     Loader(
         "stop.jsonl",
         lambda path, version: black_box.write(*_gate_entries(version), path),
         lambda path: len(black_box.replay(path).entries),
         tree=(_open_box, _save_box),
-        bombs=grow_boxes(_open_box, _save_box),
         command=("explain",),
     ),
     Loader(
@@ -249,14 +227,12 @@ WRITTEN = (
         lambda path, version: write_bytes(path, _policy_bytes(version)),
         lambda path: load_policy(path).contract.provenance.get("seed"),
         tree=(_open_contract, _save_contract),
-        bombs=grow_policies(_open_contract, _save_contract),
         command=("policy", "info"),
     ),
     Loader(
         "checkpoint.pt",
         lambda path, version: write_bytes(path, _checkpoint_bytes(version)),
         _read_checkpoint,
-        bombs=grow_checkpoints(),
     ),
 )
 
@@ -264,69 +240,33 @@ WRITTEN = (
 # Bags, by this package and by others, and CSV folders: what was recorded elsewhere.
 
 
-def _write_bag(storage: str) -> Callable[[Path, int], None]:
-    return lambda path, version: write_bag(
-        _drive(version), path, load_robot(ROBOT), storage
-    )
-
-
-def _write_foreign(compression: str) -> Callable[[Path, int], None]:
-    """Writes a bag by rosbags alone, without checksums."""
-
-    def write(path: Path, version: int) -> None:
-        from rosbags.rosbag2 import (
-            CompressionFormat,
-            CompressionMode,
-            Reader,
-            StoragePlugin,
-            Writer,
-        )
-
-        writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
-        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
-        with tempfile.TemporaryDirectory() as folder:
-            ours = Path(folder) / "bag"
-            _write_bag("mcap")(ours, version)
-            with Reader(ours) as reader, writer:
-                connections = {
-                    c.id: writer.add_connection(
-                        c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest
-                    )
-                    for c in reader.connections
-                }
-                for connection, ns, data in reader.messages():
-                    writer.write(connections[connection.id], ns, data)
-
-    return write
-
-
-def _read_bag(with_content: bool) -> Callable[[Path], object]:
-    """Reads a bag in every way that there is; returns what was read in each."""
+def _make_bag(
+    name: str, write: Callable[[Path, int], object], is_checked: bool = False
+) -> Loader:
+    """Returns the loader of a bag, which is read in every way that there is."""
 
     def read(path: Path) -> object:
         held = {}
         with open_bag(path) as bag:
             for topic, kind in bag.types.items():
-                rows = bag.read_serialized(topic)
-                content = [_hash(np.frombuffer(data, np.uint8)) for _, data in rows]
-                times = [ns for ns, _ in rows]
-                held[topic] = (kind, times, content if with_content else [])
+                rows = [(ns, bytes(data)) for ns, data in bag.read_serialized(topic)]
+                held[topic] = kind, rows if is_checked else [ns for ns, _ in rows]
         counts = {topic.topic: topic.count for topic in read_bag_info(path).topics}
         streams: Any = read_recording(path, load_robot(ROBOT)).streams
         return held, counts, len(streams["command"].t)
 
-    return read
-
-
-def _bag(name: str, write: Callable[[Path, int], None], checked: bool) -> Loader:
+    command = ("bag", "info")
     return Loader(
-        name,
-        write,
-        _read_bag(checked),
-        sealed=False,
-        text="metadata.yaml",
-        command=("bag", "info"),
+        name, write, read, sealed=False, text="metadata.yaml", command=command
     )
+
+
+def _write_own(storage: str, path: Path, version: int) -> None:
+    write_bag(_drive(version), path, load_robot(ROBOT), storage)
+
+
+def _write_foreign(compression: str, path: Path, version: int) -> None:
+    bags.write(path, bags.drive(), "mcap", compression)  # without checksums
 
 
 def _write_csv(path: Path, version: int) -> None:
@@ -338,16 +278,15 @@ def _write_csv(path: Path, version: int) -> None:
 
 
 RECORDED = (
-    _bag("ours_mcap", _write_bag("mcap"), checked=True),
-    _bag("ours_sqlite3", _write_bag("sqlite3"), checked=False),
-    _bag("foreign_mcap", _write_foreign("NONE"), checked=False),
-    _bag("foreign_packed", _write_foreign("STORAGE"), checked=False),
+    _make_bag("ours_mcap", partial(_write_own, "mcap"), is_checked=True),
+    _make_bag("ours_sqlite3", partial(_write_own, "sqlite3")),
+    _make_bag("foreign_mcap", partial(_write_foreign, "none")),
+    _make_bag("foreign_packed", partial(_write_foreign, "storage")),
     Loader(
         "csv",
         _write_csv,
         lambda path: read_recording(path, load_robot(ROBOT)),
         free=True,
-        bombs=CSVS,
     ),
 )
 
@@ -375,7 +314,6 @@ CONFIGS: dict[str, Callable[[str], object]] = {
     "training/navigation_differential": load_training,
     "maps/room": lambda path: load_map(path).arrays,
 }
-GROWING = {"worlds/arena": WORLDS, "maps/room": MAPS}
 COMMANDS = {
     "robots": ("bake", "--robot"),
     "lidars": ("bake", "--lidar"),
@@ -384,7 +322,7 @@ COMMANDS = {
 }
 
 
-def _config(kind: str, read: Callable[[str], object]) -> Loader:
+def _make_config(kind: str, read: Callable[[str], object]) -> Loader:
     source = share_folder() / "config" / f"{kind}.yaml"
 
     def write(path: Path, version: int) -> None:
@@ -398,7 +336,6 @@ def _config(kind: str, read: Callable[[str], object]) -> Loader:
         lambda path: read(str(path)),
         text=".",
         free=True,
-        bombs=GROWING.get(kind, {}),
         command=COMMANDS.get(kind.split("/")[0], ()),
     )
 
@@ -411,12 +348,12 @@ def _write_topics(path: Path, version: int) -> None:
 LOADERS = (
     *WRITTEN,
     *RECORDED,
-    *(_config(kind, read) for kind, read in CONFIGS.items()),
+    *(_make_config(kind, read) for kind, read in CONFIGS.items()),
     Loader("topics.yaml", _write_topics, load_topic_roles, text=".", free=True),
 )
 
 
-def tree_of(loader: Loader) -> Tree | None:
+def find_tree(loader: Loader) -> Tree | None:
     """Returns how the values of an input are opened and saved, or None."""
     if loader.tree is not None or not loader.text:
         return loader.tree

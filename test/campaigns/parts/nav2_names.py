@@ -18,6 +18,7 @@ from rclpy.qos import (
 
 # What nodes of Nav2 say to each other, and the frame of a lidar that its own simulator plays.
 OWN = {
+    "",
     "cmd_vel_smoothed",
     "cmd_vel_raw",
     "cmd_vel_nav",
@@ -52,29 +53,22 @@ TYPES = {
 ALWAYS = {"map", "cmd_vel", "clock", "tf", "tf_static", "initialpose", "goal_pose"}
 
 
-def values(given: Any, key: str = "") -> Iterator[tuple[str, str]]:
-    """All texts in a tree, each with the key that it stands under."""
+def walk_texts(given: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """Yields all texts in a tree, each with the key that it stands under."""
     if isinstance(given, Mapping):
         for name, each in given.items():
-            yield from values(each, str(name))
+            yield from walk_texts(each, str(name))
     elif isinstance(given, str):
         yield key, given
 
 
-def wanted(file: Path) -> tuple[set[str], set[str]]:
-    """Topics and frames that a parameter file names and that Nav2 does not make itself."""
-    text = file.read_text(encoding="utf-8")
-    named = list(values(yaml.safe_load(text)))
+def read_wanted(file: Path) -> tuple[set[str], set[str]]:
+    """Returns topics and frames that a parameter file names and that Nav2 does not make itself."""
     topics = set(ALWAYS)
     frames = set[str]()
-    for key, value in named:
+    for key, value in walk_texts(yaml.safe_load(file.read_text(encoding="utf-8"))):
         name = value.strip("/")
-        if (
-            not name
-            or name in OWN
-            or name.endswith(OWN_ENDS)
-            or key == "polygon_pub_topic"
-        ):
+        if name in OWN or name.endswith(OWN_ENDS) or key == "polygon_pub_topic":
             continue
         if key.endswith(FRAME_KEYS):
             frames.add(name)
@@ -83,12 +77,8 @@ def wanted(file: Path) -> tuple[set[str], set[str]]:
     return topics, frames
 
 
-HEARD = (
-    "cmd_vel",
-    "initialpose",
-    "goal_pose",
-    "speed_limit",
-)  # the others are published
+# the others are published
+HEARD = ("cmd_vel", "initialpose", "goal_pose", "speed_limit")
 # The other end, as Nav2 opens it: reliable, and for some with what was sent before.
 ENDLESS = {"depth": 1, "deadline": Infinite, "liveliness_lease_duration": Infinite}
 USUAL = QoSProfile(**ENDLESS)
@@ -100,12 +90,12 @@ ACTIONS = {
 }
 
 
-def unserved_topics(node: Node, topics: set[str]) -> list[str]:
-    """A line for each topic that nobody serves, with its type and quality of service."""
-    return [fault for topic in sorted(topics) if (fault := _fault(node, topic))]
+def find_unserved_topics(node: Node, topics: set[str]) -> list[str]:
+    """Returns a line for each topic that nobody serves, with its type and quality of service."""
+    return [fault for topic in sorted(topics) if (fault := _find_fault(node, topic))]
 
 
-def _fault(node: Node, topic: str) -> str:
+def _find_fault(node: Node, topic: str) -> str:
     kind = TYPES.get(topic)
     name = f"/{topic}"
     if kind is None:
@@ -125,8 +115,8 @@ def _fault(node: Node, topic: str) -> str:
     return ""
 
 
-def unserved_actions(node: Node) -> list[str]:
-    """A line for each action that nobody serves."""
+def find_unserved_actions(node: Node) -> list[str]:
+    """Returns a line for each action that nobody serves."""
     served = dict(node.get_service_names_and_types())
     return [
         f"{name}: nobody serves the action"
@@ -135,10 +125,8 @@ def unserved_actions(node: Node) -> list[str]:
     ]
 
 
-def frames_in(messages: list[Any]) -> set[str]:
-    """All frames that messages of `/tf` and `/tf_static` have told of."""
-    found = set()
-    for message in messages:
-        for each in message.transforms:
-            found |= {each.header.frame_id, each.child_frame_id}
-    return found
+def list_frames(messages: list[Any]) -> set[str]:
+    """Returns all frames that messages of `/tf` and `/tf_static` have told of."""
+    transforms = [each for message in messages for each in message.transforms]
+    parents = {transform.header.frame_id for transform in transforms}
+    return parents | {transform.child_frame_id for transform in transforms}

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.srv import SelfTest
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
+from nav2_msgs.action import FollowPath
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
-from numpy.typing import NDArray
 from rclpy.action import ActionClient
 
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.spun_node import SpunNode
 from nics_drl_bridge.policy.route import route
 
-Array = NDArray[np.float64]
 DEADLINE_S = 300.0
 # silence after which the simulator, which waits for commands, is told a zero
 STUCK_S = 2.0
@@ -28,41 +28,39 @@ REPLAN = 40  # feedbacks after which the path is replanned
 class StandIn(SpunNode):
     """Speaks to a simulator in lock-step and to a policy; relays the commands of the latter."""
 
-    def __init__(
-        self, domain_id: int, kind: Any, controller: str = "FollowPath"
-    ) -> None:
+    def __init__(self, domain_id: int, controller: str) -> None:
         super().__init__("behaviour_tree", domain_id)
         node = self.node
-        self.kind = kind
-        self.client = ActionClient(node, kind, "follow_path")
-        self.maps = list[Any]()
-        self.truths = list[Any]()
-        self.feedback = list[Any]()
+        self.client = ActionClient(node, FollowPath, "follow_path")
+        self.maps: list[Any] = []
+        self.truths: list[Any] = []
+        self._feedback: list[Any] = []
         self._commands = node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
         self.poses = node.create_publisher(
             PoseWithCovarianceStamped, "initialpose", qos.COMMAND
         )
         self._moved_s = time.monotonic()
         self._controller = controller
-        node.create_subscription(TwistStamped, "cmd_vel_raw", self._relay, qos.COMMAND)
-        node.create_subscription(OccupancyGrid, "map", self.maps.append, qos.LATCHED)
-        node.create_subscription(
-            Odometry, "ground_truth", self.truths.append, qos.SENSOR
-        )
+        for kind, topic, take, quality in (
+            (TwistStamped, "cmd_vel_raw", self._relay, qos.COMMAND),
+            (OccupancyGrid, "map", self.maps.append, qos.LATCHED),
+            (Odometry, "ground_truth", self.truths.append, qos.SENSOR),
+        ):
+            node.create_subscription(kind, topic, take, quality)
 
     def _relay(self, message: TwistStamped) -> None:
         self._moved_s = time.monotonic()
         self._commands.publish(message.twist)
 
-    def wait_for(self, done: Callable[[], Any], what: str, kick: bool = False) -> None:
+    def wait_for(self, done: Callable[[], Any], what: str) -> None:
         """Spins until something is the case. Raises TimeoutError."""
 
-        def holds() -> Any:
-            if kick and time.monotonic() - self._moved_s > STUCK_S:
+        def is_done() -> Any:
+            if time.monotonic() - self._moved_s > STUCK_S:
                 self._relay(TwistStamped())  # a message was lost
             return done()
 
-        if not self.until(holds, DEADLINE_S):
+        if not self.until(is_done, DEADLINE_S):
             raise TimeoutError(f"not within {DEADLINE_S:g} s: {what}")
 
     def call(self, kind: Any, service: str, request: Any = None) -> Any:
@@ -86,43 +84,33 @@ class StandIn(SpunNode):
         message.pose.pose = placed.pose
         self.poses.publish(message)
 
-    def plan(self, goal: Array, radius: float) -> Path:
-        """A path to a goal (2,) on the newest map."""
+    def send_path(self, goal: Array, radius: float) -> Any:
+        """Sends a path to a goal (2,), planned on the newest map; returns the goal's handle."""
         grid = conversions.map_from_ros(self.maps[-1])
-        return path_to_ros(route(grid, self.pose[:2], goal, radius))
-
-    def send(self, path: Path, **names: str) -> Any:
-        """Sends a path; returns the goal's handle."""
-        goal = self.kind.Goal(path=path)
-        for field, name in names.items():
-            if hasattr(goal, field):
-                setattr(goal, field, name)
+        path = path_to_ros(route(grid, self.pose[:2], goal, radius))
+        order = FollowPath.Goal(path=path, controller_id=self._controller)
         future = self.client.send_goal_async(
-            goal, feedback_callback=self.feedback.append
+            order, feedback_callback=self._feedback.append
         )
-        self.wait_for(future.done, "an answer to a goal", kick=True)
+        self.wait_for(future.done, "an answer to a goal")
         return future.result()
 
     def drive(self, goal: Array, radius: float) -> Any:
         """Has the robot driven to a goal (2,) and replans now and then; returns the result."""
-        handle = self.send(self.plan(goal, radius), controller_id=self._controller)
+        handle = self.send_path(goal, radius)
         while True:
-            result, known = handle.get_result_async(), len(self.feedback)
+            self._feedback.clear()
+            result = handle.get_result_async()
             self.wait_for(
-                lambda result=result, known=known: (
-                    result.done() or len(self.feedback) >= known + REPLAN
-                ),
+                lambda result=result: result.done() or len(self._feedback) >= REPLAN,
                 "a result",
-                kick=True,
             )
             if result.done():
                 return result.result()
             if math.dist(self.pose[:2], goal) > 1.0:
-                handle = self.send(
-                    self.plan(goal, radius), controller_id=self._controller
-                )
+                handle = self.send_path(goal, radius)
 
-    def touched(self) -> bool:
+    def has_touched(self) -> bool:
         """True if the robot has touched something."""
         return not any(self.call(SelfTest, "simulator_node/self_test").passed)
 
