@@ -15,10 +15,11 @@ from __future__ import annotations
 import json
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
+from importlib import import_module
 from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
@@ -40,10 +41,6 @@ from nics_drl_bridge.commands.episodes import Conditions, make_env
 from nics_drl_bridge.confidence import compare_pairs, estimate_rate
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.extras.dart.simulator import PHYSICS as DART_PHYSICS
-from nics_drl_bridge.extras.dart.simulator import DartSimulator
-from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
-from nics_drl_bridge.extras.physics.machines import Physics
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy.evaluation import drive
@@ -73,6 +70,11 @@ FAST_SUCCESS = at_least(0.95, "success in the fast simulator")
 APART = at_most(3.0, "points of success apart from the fast simulator")
 COLLISIONS = at_most(0.01, "collisions")
 Row = dict[str, Any]
+SIMULATORS = {
+    "mujoco": "nics_drl_bridge.extras.mujoco.simulator",
+    "dart": "nics_drl_bridge.extras.dart.simulator",
+    "pybullet": "parts.pybullet_simulator",
+}
 
 
 @dataclass(frozen=True)
@@ -98,31 +100,18 @@ def make_simulator(
 
     Raises ConfigError if the engine is not installed.
     """
-    if engine == "mujoco":
-        changed = replace(Physics(), **physics)
-        return MujocoSimulator(model, world, physics=changed, randomisation=drawn)
-    if engine == "dart":
-        changed = replace(DART_PHYSICS, **physics)
-        return DartSimulator(model, world, physics=changed, randomisation=drawn)
-    from parts.pybullet_simulator import PHYSICS, PybulletSimulator
-
-    return PybulletSimulator(model, world, replace(PHYSICS, **physics), drawn)
+    module = import_module(SIMULATORS[engine])
+    changed = replace(module.PHYSICS, **physics)
+    kind = getattr(module, f"{engine.capitalize()}Simulator")
+    simulator: FastSimulator = kind(model, world, physics=changed, randomisation=drawn)
+    return simulator
 
 
 def find_missing(engine: str) -> str:
     """Returns why an engine can't be driven here; nothing if it can."""
-    from parts.pybullet_simulator import load_pybullet
-
-    from nics_drl_bridge.extras.dart.scenery import load_dart
-    from nics_drl_bridge.extras.mujoco.machines import load_mujoco
-
-    load: dict[str, Callable[[], Any]] = {
-        "mujoco": load_mujoco,
-        "dart": load_dart,
-        "pybullet": load_pybullet,
-    }
     try:
-        load.get(engine, lambda: None)()
+        if engine in SIMULATORS:
+            import_module(SIMULATORS[engine])
     except ConfigError as error:
         return str(error)
     return ""

@@ -1,6 +1,5 @@
 """Nodes of other physics engines: the same robots over topics as in this process."""
 
-import sys
 from importlib import import_module
 
 import gymnasium
@@ -25,11 +24,8 @@ pytestmark = pytest.mark.ros
 
 TIMEOUT_S = 60.0
 SEEDS = (11, 12)
-# node -> library, its extra, and the name in sentences
-ENGINES = {
-    "dart_node": ("dartpy", "dart", "DART"),
-    "mujoco_node": ("mujoco", "mujoco", "MuJoCo"),
-}
+# node -> library, name
+ENGINES = {"dart_node": ("dartpy", "DART"), "mujoco_node": ("mujoco", "MuJoCo")}
 
 
 class EngineBackend(SimBackend):
@@ -80,7 +76,7 @@ def test_whole_episodes_over_topics_reach_the_goal_as_in_this_process(node, robo
     there = gymnasium.make(
         NAVIGATION, backend="dds", backend_options=options, **arguments
     )
-    backend = EngineBackend(model, world, ENGINES[name][2])
+    backend = EngineBackend(model, world, ENGINES[name][1])
     here = gymnasium.wrappers.TimeLimit(BridgeEnv(backend, **arguments), EPISODE_STEPS)
     policy = make_policy("dynamic_window", there.unwrapped.task)
     try:
@@ -103,15 +99,3 @@ def test_it_refuses_to_be_taken_for_another_model(node, robot):
             backend.reset(Start(seed=0, pose=np.zeros(3)))
     finally:
         backend.close()
-
-
-@pytest.mark.parametrize("node", ENGINES)
-def test_without_its_engine_a_node_ends_with_one_sentence(
-    node, launch, domain_id, monkeypatch
-):
-    library, extra, name = ENGINES[node]
-    monkeypatch.setitem(sys.modules, library, None)
-    started = launch(node, domain_id)
-    assert started.wait() == 2
-    fix = f"run pip install 'nics_drl_bridge[{extra}]'."
-    assert started.lines[-1] == f"{name} is not installed; {fix}"

@@ -1,21 +1,16 @@
 """Robots as MJCF for MuJoCo; tyres are ellipsoids, which neither jump nor scrub."""
 
-from typing import Any
-
 import numpy as np
 from numpy.polynomial import polynomial
 
-from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.extras.physics.machines import (
     ROLLER_MASS,
     STEERING_TORQUE,
     Machine,
     Physics,
     Wheel,
-    design_machine,
     place_rollers,
 )
-from nics_drl_bridge.robot.spec import RobotSpec
 
 # torque limit of a motor, relative to the torque of the maximum acceleration
 TORQUE_RESERVE = 1.5
@@ -28,21 +23,6 @@ STIFF_SERVO_LAG_S = 0.001
 SKIDDING = 0.01
 STEERING_STIFFNESS = 1.0  # torque of a steering servo per error [N m/rad]
 MISFIT = 0.01  # maximum error of a wheel's angle due to the tie rod [rad]
-
-
-def load_mujoco() -> Any:
-    """Returns the module `mujoco`. Raises ConfigError if it is not installed."""
-    try:
-        import mujoco
-    except ImportError:
-        fix = "run pip install 'nics_drl_bridge[mujoco]'."
-        raise ConfigError(f"MuJoCo is not installed; {fix}") from None
-    return mujoco
-
-
-def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
-    """Designs a robot's machine. Raises ConfigError for an unknown kind or a missing parameter."""
-    return design_machine(spec, physics or Physics(), "MuJoCo")
 
 
 def write_mjcf(machine: Machine, physics: Physics) -> str:

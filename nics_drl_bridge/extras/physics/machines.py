@@ -82,6 +82,26 @@ class Machine:
     gyro: bool = False  # True: odometry gets the turn rate from a gyro, not from wheels
 
 
+def weigh_chassis(machine: Machine, physics: Physics) -> Array:
+    """Returns the moments of inertia (3,) of a chassis about its centre [kg m^2]."""
+    squares = np.square(machine.size)
+    return np.asarray(physics.mass * (squares.sum() - squares) / 12.0)
+
+
+def weigh_wheel(
+    wheel: Wheel, machine: Machine, physics: Physics
+) -> tuple[float, Array]:
+    """Returns the mass [kg] and moments of inertia (3,) [kg m^2] of a wheel without rollers."""
+    mass = physics.wheel_mass
+    radius = machine.radius
+    width = 0.4 * radius
+    if wheel.lean:
+        mass -= physics.rollers * ROLLER_MASS
+        radius *= 0.7
+    across = mass * (3.0 * radius**2 + width**2) / 12.0
+    return mass, np.array([across, 0.5 * mass * radius**2, across])
+
+
 def design_machine(spec: RobotSpec, physics: Physics, engine: str) -> Machine:
     """Designs a robot's machine. Raises ConfigError for an unknown kind or a missing parameter."""
     kind = require_textbook(spec)

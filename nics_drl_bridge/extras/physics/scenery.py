@@ -60,6 +60,16 @@ class Prism:
 Solid = Box | Cylinder | Prism
 
 
+@dataclass(frozen=True)
+class Obstacle:
+    """An obstacle of a scene."""
+
+    number: int  # row of the scene's bodies
+    shape: Shape
+    pose: Array  # (3,) x [m], y [m], heading [rad]
+    moves: bool
+
+
 def cut_world(world: World) -> Iterator[Box]:
     """Yields the walls and the map of a world."""
     for wall in world.all_walls():

@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,11 +12,13 @@ from numpy.typing import ArrayLike
 from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.extras.physics.driven import DrivenSimulator
-from nics_drl_bridge.extras.physics.machines import Machine, Physics
+from nics_drl_bridge.extras.physics.machines import Machine, Physics, design_machine
+from nics_drl_bridge.extras.physics.scenery import Box, Obstacle, cut_world
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar import fault_kernels
 from nics_drl_bridge.lidar.arrays import Integers, Singles
+from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import HOLD_S, ROW_S
@@ -184,8 +186,10 @@ class PhysicsSimulator(DrivenSimulator, ABC):
 
     Commands act on motors with their own lag, so the model's latency is not added. A randomisation
     adds its latency, but its factors on the model's kinematics have no effect. Raises ConfigError
-    if the engine, textbook kinematics, a parameter of the machine or free space is missing.
+    if textbook kinematics, a parameter of the machine or free space is missing.
     """
+
+    engine: str  # name of the engine
 
     def __init__(
         self,
@@ -200,19 +204,31 @@ class PhysicsSimulator(DrivenSimulator, ABC):
             model.control_period, physics.timestep
         )
         self._physics = replace(physics, timestep=timestep)
-        self._machine = self.design(model.robot, self._physics)
+        self._machine = design_machine(model.robot, self._physics, self.engine)
         self._twist = textbook(model.robot).twist
-        drawn: Any = {"renderer": renderer, "randomisation": randomisation}
-        super().__init__(model, world, robots=robots, **drawn)
+        super().__init__(
+            model,
+            world,
+            robots=robots,
+            renderer=renderer,
+            randomisation=randomisation,
+        )
         self.reset([0])
-
-    @abstractmethod
-    def design(self, spec: RobotSpec, physics: Physics) -> Machine:
-        """Prepares the machine of all robots."""
 
     @abstractmethod
     def compile(self, bodies: Array) -> list[Any]:
         """Builds the scene with obstacles (K, 7), and returns the rigs of robots to be placed."""
+
+    def list_walls(self) -> Iterator[Box]:
+        """Yields the walls and the map of this episode's world."""
+        return cut_world(self.world.members[int(self.data.member[0])])
+
+    def list_obstacles(self, bodies: Array) -> Iterator[Obstacle]:
+        """Yields the obstacles that there are among bodies (K, 7)."""
+        motions = self.sampler.motions[int(self.data.member[0])]
+        for k in np.flatnonzero(bodies[:, RADIUS] > 0.0).tolist():
+            shape = self.sampler.shapes[int(bodies[k, SHAPE])]
+            yield Obstacle(k, shape, bodies[k, :3], motions[k] is not None)
 
     def refresh(self) -> None:
         """Updates derived values after the robots were placed."""

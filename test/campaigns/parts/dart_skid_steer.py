@@ -158,9 +158,9 @@ class Engine:
         self.world = dartpy.simulation.World()
         self.world.setTimeStep(STEP_S)
         self.world.setCollisionDetector(dartpy.simulation.CollisionDetectorType.ODE)
-        ground = scenery.add_fixed_body(dartpy, self.world, "ground")
+        ground = scenery.add_fixed_body(self.world, "ground")
         slab = dartpy.dynamics.BoxShape([80.0, 80.0, 0.2])
-        below = scenery.make_transform(dartpy, [0.0, 0.0, -0.1])
+        below = scenery.make_transform([0.0, 0.0, -0.1])
         scenery.let_touch(scenery.add_shape(ground, slab, below), friction=1.0)
         self._add_walls(place)
         self._robot = dartpy.utils.DartLoader().parseSkeletonString(robot_urdf(), "")
@@ -172,18 +172,16 @@ class Engine:
         self.wheel_speeds = np.zeros(4)  # asked of the motors [rad/s]
 
     def _add_walls(self, place: Place) -> None:
-        body = scenery.add_fixed_body(dartpy, self.world, "walls")
+        body = scenery.add_fixed_body(self.world, "walls")
         length, width = place.size + THICK
         for sign in (-1, 1):
             beside = Box(np.array([0.0, sign * 0.5 * width]), 0.0, (length, THICK))
             ahead = Box(np.array([sign * 0.5 * length, 0.0]), 0.0, (THICK, width))
             for wall in (beside, ahead):
-                scenery.add_solid(dartpy, body, wall, level=0.5, height=1.0)
+                scenery.add_solid(body, wall, level=0.5, height=1.0)
         for x, y, radius in place.pillars:
             pose = np.array([x, y, 0.0])
-            scenery.add_solid(
-                dartpy, body, Cylinder(radius), level=0.5, height=1.0, pose=pose
-            )
+            scenery.add_solid(body, Cylinder(radius), level=0.5, height=1.0, pose=pose)
 
     def _prepare_wheels(self) -> None:
         names = [degree.getName() for degree in self._robot.getDofs()]
