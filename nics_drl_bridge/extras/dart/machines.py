@@ -34,12 +34,12 @@ class DartBody:
     """A robot that is not yet in a world."""
 
     skeleton: Any
-    joints: list[Any]  # those with encoders, in the order of the machine
-    height: float  # of its root above the floor [m]
+    joints: list[Any]  # joints with encoders, in the order of the machine
+    height: float  # height of its root above the floor [m]
 
 
 def make_body(machine: Machine, physics: Physics, file: Path | None = None) -> DartBody:
-    """Returns a machine's robot, read from a file if there is one. Raises ConfigError."""
+    """Builds the robot of a machine, or reads it from a file. Raises ConfigError."""
     if file is not None:
         return _read_robot(file, machine, physics)
     return _Builder(machine, physics).build()
@@ -144,13 +144,13 @@ def _read_skeleton(path: Path) -> Any:
 
 
 def _read_robot(path: Path, machine: Machine, physics: Physics) -> DartBody:
-    """Reads a robot from a URDF or SDF file; its wheels are found by axles and places.
+    """Reads a robot from a URDF or SDF file; finds its wheels by their axles and places.
 
-    Raises ConfigError if it can't be read, or has no wheel, or several, where the machine has one.
+    Raises ConfigError if it can't be read, or unless one joint fits each joint of the machine.
     """
     skeleton = _read_skeleton(path)
     root = skeleton.getRootBodyNode()
-    _set_friction(root, 0.0)  # a castor that is a part of it slides
+    _set_friction(root, 0.0)  # a castor that is part of the base slides
     hinges = [
         _Hinge(joint, root)
         for joint in skeleton.getJoints()
@@ -161,7 +161,7 @@ def _read_robot(path: Path, machine: Machine, physics: Physics) -> DartBody:
     for wheel in wheels:
         _set_friction(wheel.joint.getChildBodyNode(), physics.friction)
     joints = []
-    levels = []  # of the wheels' axles, relative to the root
+    levels = []  # heights of the wheels' axles above the root
     for name in machine.joints:
         fitting = _find_fitting(name, pivots if name.startswith("steer") else wheels)
         if len(fitting) != 1:
@@ -185,7 +185,7 @@ def _set_friction(body: Any, friction: float) -> None:
 
 
 class _Hinge:
-    """A joint of a robot at rest, seen from its root."""
+    """A revolute joint, with its axis and place in the root's frame while the robot is at rest."""
 
     def __init__(self, joint: Any, root: Any) -> None:
         self.joint = joint
@@ -194,13 +194,13 @@ class _Hinge:
         self.place = transform.translation()
 
     def turn_positive(self) -> None:
-        """Lets positive speeds drive ahead, or turn to the left."""
+        """Makes positive speeds drive ahead, or turn to the left."""
         if self.axis.sum() < 0.0:
             self.joint.setAxis(-self.joint.getAxis())
 
 
 def _find_fitting(name: str, hinges: list[_Hinge]) -> list[_Hinge]:
-    """Returns the hinges on the side, and at the end, that the words of a name say."""
+    """Returns the hinges on the side and at the end that a name such as `rear_left` denotes."""
     x, y, _ = np.array([hinge.place for hinge in hinges]).reshape(-1, 3).T
     half_width = 0.5 * np.abs(y).max(initial=0.0)
     middle = 0.5 * (x.min(initial=np.inf) + x.max(initial=-np.inf))

@@ -25,7 +25,7 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 ORIGIN = np.zeros(3)
 EDGE = 1e-5  # radius of the edges of a prism [m]
 RIM = 0.01  # thickness of the sides of a prism [m]
-# of the solver of contacts: its results are measured against the textbook
+# settings of the contact solver, chosen by comparison with the textbook
 TOLERANCE = 1e-3
 MOST_SWEEPS = 30
 
@@ -34,12 +34,12 @@ def make_world(physics: Physics) -> Any:
     """Returns a world with a floor, whose skeleton is the first."""
     world = dartpy.simulation.World()
     world.setTimeStep(physics.timestep)
-    # Gazebo's choice; Bullet, which casts the rays, rounds what touches by 0.04 m.
+    # As in Gazebo. Bullet, which casts the rays, would round colliding shapes by 0.04 m.
     world.setCollisionDetector(dartpy.collision.OdeCollisionDetector())
     sleep = world.getDeactivationOptions()
     sleep.mEnabled = False
     world.setDeactivationOptions(sleep)
-    # By default, friction is limited along x and y apart, and robots skid too little in turns.
+    # By default, friction is limited along x and y separately: robots skid too little in turns.
     solver = dartpy.constraint.NsgsFrictionSolver()
     options = solver.getOptions()
     options.tolerance = TOLERANCE
@@ -53,7 +53,7 @@ def make_world(physics: Physics) -> Any:
 
 
 def add_fixed_body(world: Any, name: str) -> Any:
-    """Adds a body at the origin that nothing moves; returns it."""
+    """Adds an immobile body at the origin; returns it."""
     skeleton = dartpy.dynamics.Skeleton(name)
     _, body = skeleton.createFreeJointAndBodyNodePair()
     body.setName(name)
@@ -73,7 +73,7 @@ def place_body(body: Any, pose: Array, height: float = 0.0) -> None:
 
 
 def add_shape(body: Any, shape: Any, transform: Any = None) -> Any:
-    """Adds a shape to a body, which rays may see but nothing touches; returns its node."""
+    """Adds a shape that rays can hit but nothing touches to a body; returns its node."""
     node = body.createShapeNode(shape)
     if transform is not None:
         node.setRelativeTransform(transform)
@@ -109,8 +109,8 @@ def add_solid(
 ) -> Any:
     """Adds a solid at a pose (3,) in a body's frame; returns the node that rays see.
 
-    The solid reaches as far above as below the `level` [m]. Rays see a cylinder or a hull, in whose
-    place a capsule or boxes along the sides touch others, because ODE computes those exactly.
+    The solid is centred at the `level` [m]. For collisions, a capsule stands in for a cylinder and
+    boxes along the sides for a prism, because ODE computes their contacts exactly.
     """
     shapes = dartpy.dynamics
     if isinstance(solid, Box):

@@ -52,7 +52,7 @@ class DartRig(ServoRig):
         self._frame = dartpy.dynamics.Frame.World()
         self.base = body.skeleton.getRootBodyNode()
         self._joints = [joint.getIndexInSkeleton(0) for joint in body.joints]
-        # enough to let one tyre slide that carries all
+        # enough to make a tyre slide that carries the whole robot
         torque = physics.friction * body.skeleton.getMass() * GRAVITY * machine.radius
         for name, joint in zip(machine.joints, body.joints, strict=True):
             joint.setActuatorType(dartpy.dynamics.ActuatorType.SERVO)
@@ -186,7 +186,7 @@ class DartSimulator(RayCastingSimulator):
         return self._add_robots(seen, [fixed, *self._moving.values()])
 
     def _add_robots(self, seen: list[Any], obstacles: list[Any]) -> list[DartRig]:
-        """Adds the robots, of which only bumpers touch obstacles, and lets them see."""
+        """Adds the robots, whose bumpers alone touch obstacles, and what their lidars see."""
         spec = self.model.robot
         height = self._machine.radius
         rigs = []

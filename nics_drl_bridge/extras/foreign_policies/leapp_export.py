@@ -33,7 +33,6 @@ CONFIG_VERSION = "1.3"  # version of the format
 SIGN = "system information:"  # in the YAML file of every bundle
 OURS = "leapp/"  # prefix of the nodes and weights that an export adds
 TAKEN = "nics_drl_bridge_observation"  # metadata key: the input that an export replaces
-AXES = ["x", "y", "z"]
 SECTORS = "state/lidar/sectors"
 BEAMS = "state/lidar/beams"
 Data = dict[str, Any]
@@ -82,39 +81,53 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
 def _list_pieces(policy: PolicyFile) -> list[Piece]:
     """Returns the inputs of a bundle, in the order of the observation."""
     contract = policy.contract
-    parts = contract.observation.scan_parts
-    rest = len(contract.observation.rest_low)
-    layout = contract.scan
-    lidar = contract.lidar
-    seen: Data = {"kind": BEAMS, "lidar": lidar.model_dump(mode="json")}
-    if layout is not None:
-        seen = {"kind": SECTORS, "scan": layout.model_dump(mode="json")}
+    seen: Data = {"kind": BEAMS, "lidar": contract.lidar.model_dump(mode="json")}
+    if contract.scan is not None:
+        seen = {"kind": SECTORS, "scan": contract.scan.model_dump(mode="json")}
     seen["unit"] = "fraction of range_max; 1 free, 0 too close or unknown"
-    pieces = [Piece("scan", parts, tuple(range(parts)), seen)]
-    facts: Data
+    scan = _make_whole_piece("scan", contract.observation.scan_parts, seen)
+    low = contract.observation.rest_low
+    high = contract.observation.rest_high
     if contract.task.name != "navigation":
-        low = contract.observation.rest_low
-        high = contract.observation.rest_high
         limits = [list(pair) for pair in zip(low, high, strict=True)]
         facts = {"kind": f"state/task/{contract.task.name}", "limits": limits}
-        return [*pieces, Piece("rest", rest, tuple(range(rest)), facts)]
-    goal = ["goal.distance", "goal.cosine", "goal.sine"]
-    for name, kind, kept, elements, unit in (
-        ("goal", "command/goal/polar", (0, 1, 2), goal, "m"),
-        ("linear_velocity", "state/body/linear_velocity", (0, 1), AXES, "m/s"),
-        ("angular_velocity", "state/body/angular_velocity", (2,), AXES, "rad/s"),
-    ):
-        facts = {"kind": kind, "element_names": [elements], "unit": unit}
-        pieces.append(Piece(name, 3, kept, facts))
-    for sensor in contract.sensors:
-        facts = {
-            "kind": f"state/{sensor.kind}",
-            "sensor": sensor.model_dump(mode="json"),
-        }
-        pieces.append(
-            Piece(sensor.name, sensor.parts, tuple(range(sensor.parts)), facts)
+        return [scan, _make_whole_piece("rest", len(low), facts)]
+    sensors = [
+        _make_whole_piece(
+            sensor.name,
+            sensor.parts,
+            {"kind": f"state/{sensor.kind}", "sensor": sensor.model_dump(mode="json")},
         )
-    return pieces
+        for sensor in contract.sensors
+    ]
+    return [scan, *GOAL_AND_TWIST, *sensors]
+
+
+def _make_whole_piece(name: str, width: int, facts: Data) -> Piece:
+    """Returns an input whose elements are all in the observation."""
+    return Piece(name, width, tuple(range(width)), facts)
+
+
+def _make_piece(
+    name: str, kind: str, kept: tuple[int, ...], elements: list[str], unit: str
+) -> Piece:
+    """Returns an input of three elements, of which the observation has those that are kept."""
+    facts = {"kind": kind, "element_names": [elements], "unit": unit}
+    return Piece(name, 3, kept, facts)
+
+
+AXES = ["x", "y", "z"]
+GOAL_AND_TWIST = (
+    _make_piece(
+        "goal",
+        "command/goal/polar",
+        (0, 1, 2),
+        ["goal.distance", "goal.cosine", "goal.sine"],
+        "m",
+    ),
+    _make_piece("linear_velocity", "state/body/linear_velocity", (0, 1), AXES, "m/s"),
+    _make_piece("angular_velocity", "state/body/angular_velocity", (2,), AXES, "rad/s"),
+)
 
 
 def _split_observation(model: Any, pieces: Iterable[Piece]) -> None:

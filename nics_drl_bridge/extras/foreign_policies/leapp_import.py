@@ -137,8 +137,8 @@ def find_description(place: Path) -> Path | None:
     return descriptions[0] if descriptions else None
 
 
-def _read_network(path: Path, parameters: Parameters, place: str) -> bytes:
-    """Reads the network of a node of a bundle. Raises PolicyError."""
+def _read_network(path: Path, parameters: Parameters, place: str) -> Any:
+    """Reads and checks the network of a node, an onnx.ModelProto. Raises PolicyError."""
     if parameters.backend != "onnx":
         reason = (
             f"is {parameters.backend!r}, which is not supported; export it with 'onnx'."
@@ -150,7 +150,9 @@ def _read_network(path: Path, parameters: Parameters, place: str) -> bytes:
             f"does not match {parameters.model_path!r}, which was changed or damaged."
         )
         raise PolicyError(str(path), f"{place}.sha256sum", reason)
-    return data
+    file = str(path.parent / parameters.model_path)
+    rehearsal.rehearse(data, file, runs=False)
+    return onnx_graph.parse(data, file)
 
 
 def read_bundle(path: Path) -> Bundle:
@@ -158,15 +160,11 @@ def read_bundle(path: Path) -> Bundle:
     source = str(path)
     description = validate(parse_yaml(read_text(path), source), Description, source)
     pipeline = description.pipeline
-    models = {}
-    digests = []
-    for name, node in description.models.items():
-        parameters = node.parameters
-        data = _read_network(path, parameters, f"models.{name}.parameters")
-        digests.append(parameters.sha256sum)
-        file = str(path.parent / parameters.model_path)
-        rehearsal.rehearse(data, file, runs=False)
-        models[name] = onnx_graph.parse(data, file)
+    models = {
+        name: _read_network(path, node.parameters, f"models.{name}.parameters")
+        for name, node in description.models.items()
+    }
+    digests = [node.parameters.sha256sum for node in description.models.values()]
     names = _name_ends(pipeline)
     starts = {}
     if pipeline.initial_values is not None:

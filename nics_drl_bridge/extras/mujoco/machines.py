@@ -14,9 +14,10 @@ from nics_drl_bridge.extras.physics.machines import (
 
 # torque limit of a motor, relative to the torque of the maximum acceleration
 TORQUE_RESERVE = 1.5
-ROTOR = 0.25  # inertia of a geared motor, relative to its share of the robot's inertia
+# inertia of a geared motor, relative to the robot's inertia per driven wheel
+ROTOR = 0.25
 SERVO_LAG_S = 0.005  # lag of a motor behind its set point
-# the same for a motor that keeps its speed although its tyres are dragged sideways
+# the same for a motor that must keep its speed while its tyres are dragged sideways
 STIFF_SERVO_LAG_S = 0.001
 # MuJoCo's `impratio`: stiffness of tyres against skidding relative to that against compression.
 # At 1, MuJoCo's convex contacts lift sliding wheels so far that they hop off the floor.

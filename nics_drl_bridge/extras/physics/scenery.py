@@ -1,4 +1,4 @@
-"""A world as solids that every physics engine has: upright boxes, cylinders and convex prisms."""
+"""A world as solids that every physics engine supports: upright boxes, cylinders, convex prisms."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

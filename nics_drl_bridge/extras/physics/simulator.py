@@ -110,10 +110,10 @@ class Rig(ABC):
 
 
 class ServoRig(Rig):
-    """A rig whose motors hold speeds while the tyres can, set again before each time step.
+    """A rig whose motors are speed servos, with new set points before each time step.
 
     The speeds follow a wanted state with the motors' lags. A differential between driven wheels
-    gives each the speed of its own circle.
+    gives each wheel the speed for its turning radius.
     """
 
     def __init__(self, spec: RobotSpec, machine: Machine, timestep: float) -> None:
@@ -217,7 +217,7 @@ class PhysicsSimulator(DrivenSimulator, ABC):
 
     @abstractmethod
     def compile(self, bodies: Array) -> list[Any]:
-        """Builds the scene with obstacles (K, 7), and returns the rigs of robots to be placed."""
+        """Builds the scene with obstacles (K, 7); returns the robots' rigs, not yet placed."""
 
     def list_walls(self) -> Iterator[Box]:
         """Yields the walls and the map of this episode's world."""
@@ -309,33 +309,38 @@ class PhysicsSimulator(DrivenSimulator, ABC):
         wheels = self.wheels.copy()
         counted = np.zeros((len(rigs), 3))
         touched = np.zeros(len(rigs), np.bool_)
-        turned = [rig.encoders() for rig in rigs]
-        facing = [rig.heading() for rig in rigs]
+        joints = [rig.encoders() for rig in rigs]
+        headings = [rig.heading() for rig in rigs]
         for part in range(self._subperiods):
             for rig, command in zip(rigs, self.in_force(part * part_s), strict=True):
                 rig.command(command)
             self.place_obstacles(self.move_obstacles((part + 1) * part_s))
             touched[self.advance(self._steps)] = True
-            before = turned
-            turned = [rig.encoders() for rig in rigs]
-            faced = facing
-            facing = [rig.heading() for rig in rigs]
-            pairs = zip(before, turned, strict=True)
-            mean = self._machine.state
-            means = [
-                mean(0.5 * (first + last), (last - first) / part_s)
-                for first, last in pairs
-            ]
-            counted = self._twist(np.array(means)) * self._machine.calibrated
-            if self._machine.gyro:
-                turned_by = geometry.wrap_angle(np.subtract(facing, faced))
-                counted[:, 2] = turned_by / part_s + self._draw_gyro_errors()
+            counted = self._measure_twists(joints, headings, part_s)
+            joints = [rig.encoders() for rig in rigs]
+            headings = [rig.heading() for rig in rigs]
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
         readings = [rig.read() for rig in rigs]
         pose, twist, state = (
             np.array([getattr(r, n) for r in readings]) for n in MOTION
         )
         self.end_period(pose, twist, state, wheels, counted, touched)
+
+    def _measure_twists(
+        self, joints: Sequence[Array], headings: Sequence[float], part_s: float
+    ) -> Array:
+        """Returns twists (M, 3) by wheel odometry, since the joints and headings before."""
+        states = []
+        for rig, before in zip(self._rigs, joints, strict=True):
+            now = rig.encoders()
+            mean = self._machine.state(0.5 * (before + now), (now - before) / part_s)
+            states.append(mean)
+        twists = self._twist(np.array(states)) * self._machine.calibrated
+        if self._machine.gyro:
+            turned = np.subtract([rig.heading() for rig in self._rigs], headings)
+            rates = geometry.wrap_angle(turned) / part_s
+            twists[:, 2] = rates + self._draw_gyro_errors()
+        return np.asarray(twists)
 
     def _draw_gyro_errors(self) -> Array:
         physics = self._physics
@@ -346,7 +351,7 @@ class PhysicsSimulator(DrivenSimulator, ABC):
 class RayCastingSimulator(PhysicsSimulator):
     """A PhysicsSimulator whose engine also casts the lidar's rays.
 
-    Scans that are late or skewed are the FastSimulator's, because they need the past.
+    Late or skewed scans are those of the FastSimulator, because they depend on past poses.
     """
 
     @abstractmethod
