@@ -36,9 +36,10 @@ from campaign import (
 )
 from measuring.evaluations import Standing
 from measuring.perturbations import open_real_model
+from scipy import stats
 
 from nics_drl_bridge.commands.episodes import Conditions, make_env
-from nics_drl_bridge.confidence import compare_pairs, estimate_rate
+from nics_drl_bridge.confidence import estimate_rate
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.gated_backend import GatedBackend
@@ -267,9 +268,20 @@ def compare_engines(
         }
         if FAST in engines and engine != FAST:
             fast = [ended[robot, FAST][seed]["result"] == "success" for seed in seeds]
-            figures |= asdict(compare_pairs(fast, success))
+            figures |= compare_pairs(fast, success)
         compared[robot][engine] = figures
     return compared
+
+
+def compare_pairs(first: Sequence[bool], second: Sequence[bool]) -> dict[str, float]:
+    """Compares the successes of the same episodes by McNemar's exact test (1947)."""
+    pairs = list(zip(first, second, strict=True))
+    lost = sum(before and not after for before, after in pairs)
+    gained = sum(after and not before for before, after in pairs)
+    # If chance alone decides, each of the unequal pairs is lost or gained like a coin toss.
+    p = stats.binomtest(lost, lost + gained).pvalue if lost + gained else 1.0
+    points = 100.0 * (gained - lost) / max(len(pairs), 1)
+    return {"points": points, "lost": lost, "gained": gained, "p": float(p)}
 
 
 def judge(result: Result) -> list[str]:
