@@ -13,7 +13,6 @@ runs, `figures.py` makes the tables.
 
 import argparse
 import json
-import math
 import os
 import platform
 import signal
@@ -30,6 +29,8 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NoReturn
+
+from nics_drl_bridge.files import format_json, write_text
 
 SCRIPTS = Path(__file__).resolve().parent
 ROOT = SCRIPTS.parent
@@ -212,21 +213,11 @@ def answer(result: Mapping[str, Any], missed: Sequence[str], as_json: bool) -> N
         as_json: whether to print one JSON object, with the sentences as `failures`.
     """
     if as_json:
-        told = finite({**result, FAILURES: list(missed)})
-        sys.stdout.write(json.dumps(told, allow_nan=False) + "\n")
+        sys.stdout.write(format_json({**result, FAILURES: list(missed)}) + "\n")
     else:
         sys.stdout.write(table_of(result))
         sys.stdout.write("".join(f"FAILED: {line}\n" for line in missed))
     raise SystemExit(1 if missed else 0)
-
-
-def finite(value: Any) -> Any:
-    """The same with None for each number that JSON does not know: NaN and the infinities."""
-    if isinstance(value, Mapping):
-        return {key: finite(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 # The runs. `make benchmark` takes half an hour on two cores; LONG=1 takes hours and gives the
@@ -373,7 +364,9 @@ def judge(code: int | None, printed: str, last: str) -> dict[str, Any]:
     """
     result = None
     with suppress(ValueError, RecursionError, IndexError):
-        result = json.loads(printed.strip().splitlines()[-1])
+        result = json.loads(
+            printed.strip().splitlines()[-1], parse_constant=lambda _: None
+        )
     failures = result.pop(FAILURES, None) if isinstance(result, dict) else None
     error = None
     if code is None:
@@ -390,7 +383,7 @@ def judge(code: int | None, printed: str, last: str) -> dict[str, Any]:
         "state": state if error is None else BROKEN,
         "failures": failures,
         "error": error,
-        "result": finite(result) if error is None else None,
+        "result": result if error is None else None,
     }
 
 
@@ -437,11 +430,8 @@ def read_all(file: Any) -> str:
 
 def write_results(runs: Mapping[str, Any], file: Path) -> None:
     """Replaces the file at once or not at all."""
-    text = json.dumps({"runs": dict(sorted(runs.items()))}, indent=1, allow_nan=False)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(f".{file.name}.{os.getpid()}")
-    part.write_text(text + "\n", encoding="utf-8")
-    part.replace(file)
+    text = format_json({"runs": dict(sorted(runs.items()))}, indent=1)
+    write_text(file, f"{text}\n")
 
 
 def read_results(file: Path) -> dict[str, Any]:

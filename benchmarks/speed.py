@@ -1,7 +1,7 @@
-"""Speed beside peers: environments, scans among obstacles and in maps, nodes of ROS 2.
+"""Speed beside peers: environments, scans among obstacles, nodes of ROS 2.
 
 python benchmarks/speed.py env_throughput | env_scaling
-python benchmarks/speed.py lidar_peers | map_lidar
+python benchmarks/speed.py lidar_peers
 python benchmarks/speed.py ros_lockstep | vehicle_load
 """
 
@@ -28,7 +28,6 @@ from bench import (
     run_benchmark,
 )
 from measuring import peers
-from measuring.grids import MAPS, RESOLUTION, draw_poses, scan_map
 from measuring.rates import interleaved, medians, slowed
 from measuring.scenes import BATCH, CIRCLE, errors
 from numpy.typing import NDArray
@@ -40,15 +39,13 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.bake import bake
-from nics_drl_bridge.lidar.beam_kernels import make_beams
 from nics_drl_bridge.lidar.faults import LidarFaults
-from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
-from nics_drl_bridge.sim.scenes import Scene, sample_scene
+from nics_drl_bridge.sim.scenes import Scene
 from nics_drl_bridge.sim.world import World
-from nics_drl_bridge.sim.world_set import AnyWorld, WorldSet
+from nics_drl_bridge.sim.world_set import AnyWorld
 
 # Environments beside peers
 
@@ -214,10 +211,9 @@ def measure_throughput(given: Given) -> Result:
     estimator, two other simulators do the same task in the same scenes, all timed in turn.
 
     `times_as_fast_at_equal_work` is our vector env on one thread against them with one scan per
-    control period, as ours has; `times_as_fast_with_ten_scans` against ten of their own steps,
-    each of which scans: see measuring/peers.py. (irsim-x can also step many robots at once, but
-    all in one scene, without a new one as each episode ends.) Bars are ratios within the run: to
-    the peers, to writing as many bytes as the observations have, and to Gymnasium's CartPole.
+    control period, as ours has: see measuring/peers.py. (irsim-x can also step many robots at once,
+    but all in one scene, without a new one as each episode ends.) Bars are ratios within the run:
+    to the peers, to writing as many bytes as the observations have, and to Gymnasium's CartPole.
 
     With another `--lidar`, or more `--obstacles`, in a field as crowded, only our envs are timed,
     beside the usual one: `share_of_usual` is what is left of its steps per second.
@@ -266,11 +262,9 @@ def measure_throughput(given: Given) -> Result:
         "share_of_cartpole_with_estimator": rate["estimator"] / step,
         "drove": {name: watch_chunk(one) for name, one in ours.items()},
     }
-    for key, scans in (("at_equal_work", "one_scan"), ("with_ten_scans", "ten_scans")):
-        result[f"times_as_fast_{key}"] = {
-            name: rate["one"] * one[f"period_with_{scans}_s"]
-            for name, one in found.peers.items()
-        }
+    result["times_as_fast_at_equal_work"] = {
+        name: rate["one"] * one["period_s"] for name, one in found.peers.items()
+    }
     if not case.is_usual:
         result["share_of_usual"] = rate["one"] / rate["usual"]
         changed = "lidar" if case.lidar else "obstacles"
@@ -304,7 +298,6 @@ def judge_equal_work(result: Result, least: Mapping[str, float]) -> list[str]:
 # Environments as something grows
 
 MOST_TIMES = {"worlds": 0.5, "robots": 4.0, "obstacles": 12.0, "beams": 12.0}
-MOST_TIMES["members"] = 1.15
 WORLDS = 256
 OBSTACLES = 10
 SIDE = 8.0
@@ -314,7 +307,6 @@ SWEEPS: dict[str, tuple[int, ...]] = {
     "robots": (1, 2, 4, 8, 16, 32, 64),
     "obstacles": (1, 4, 16, 64, 256),
     "beams": (36, 90, 180, 360, 720, 1440, 2048),
-    "members": (1, 5, 25, 250),
 }
 AREA_PER_ROBOT = 12.0  # [m^2]
 AREA_PER_OBSTACLE = 4.0  # [m^2]
@@ -351,20 +343,6 @@ def make_field(obstacles: int, side: float) -> World:
     )
 
 
-def make_members(count: int) -> list[World]:
-    """Returns worlds whose circles stand where a seed each puts them in the usual field."""
-    usual = make_field(OBSTACLES, SIDE)
-    (group,) = usual.obstacles
-    found = []
-    for seed in range(count):
-        bodies = sample_scene(usual, peers.MODEL.robot.footprint_radius, seed).bodies
-        at = tuple((x, y, 0.0) for x, y in bodies[:, :2].tolist())
-        stands = group.model_copy(update={"count": None, "at": at})
-        changes = {"name": f"field_{seed}", "obstacles": (stands,)}
-        found.append(usual.model_copy(update=changes))
-    return found
-
-
 def make_env(
     worlds: int = WORLDS,
     robots: int = 1,
@@ -399,8 +377,6 @@ def make_point(name: str, value: int) -> BridgeVectorEnv:
     if name == "obstacles":
         side = max(SIDE, math.sqrt(value * AREA_PER_OBSTACLE))
         return make_env(world=make_field(value, side))
-    if name == "members":
-        return make_env(world=WorldSet("fields", tuple(make_members(value))))
     return make_env(beams=value)
 
 
@@ -447,8 +423,6 @@ def measure_scaling(given: Given) -> Result:
     autoreset, random actions. Unless it is what grows: 256 worlds of one robot, 10 circles on
     8 x 8 m, 720 beams. Robots and obstacles get a field that grows with them, so that as many as
     before are in range; what then grows faster than their number is the search for them.
-    `members` are the worlds of a set, each with its own ten circles at fixed places, among which
-    the 256 episodes are.
     """
     result: Result = {}
     for name, sizes in SWEEPS.items():
@@ -531,8 +505,7 @@ def measure_lidar_peers(given: Given) -> Result:
 
     ir-sim and irsim-x scan at the starts of the scenes of env_throughput, as the scanner does,
     exact and baked, and every scan is compared with our exact one. What is timed is a scan alone,
-    the very call that their step makes, in turn with ours: `times_as_fast_at_equal_work`. What a
-    scan costs within their step is told beside it, and has to agree: see measuring/peers.py.
+    the very call that their step makes, in turn with ours: `times_as_fast_at_equal_work`.
     """
     rivals = () if given.without_peers else tuple(peers.PEERS)
     table = bake(SPREAD, (CIRCLE,))
@@ -567,64 +540,6 @@ def judge_lidar_peers(result: Result) -> list[str]:
     missed = missed_bars(result, {"share_of_write_limit": SCANS_WRITTEN})
     missed += missed_bars(result["rmse_m"], bars, "RMSE [m]: ")
     return missed + judge_equal_work(result, SCANS_AT_EQUAL_WORK)
-
-
-# Scans in maps
-
-MAP_LIDARS = ("paper", "paper_12m")
-# Times the walk's speed, RMSE, and the fraction of beams that may be off by 1 mm.
-MAP_BARS = {
-    "ratio": at_least(3.0, "times the walk's speed"),
-    "rmse_m": at_most(1e-5, "RMSE [m]"),
-    "beams_off": at_most(1e-5, "fraction of the beams that are off by 1 mm"),
-}
-
-
-def measure_maps(given: Given) -> Result:
-    """Static maps: how much faster are jumps over free squares than walking from cell to cell?
-
-    Two generated maps of 20 m x 20 m at 0.05 m: an office, and the same as a SLAM would leave it,
-    with ragged edges and specks. One thread; ranges beyond range_max count as range_max.
-    """
-    rows = []
-    for name, make in MAPS.items():
-        grid = GridMap((make(given.seed) * OCCUPIED).astype(np.int8), RESOLUTION)
-        squares, _ = grid.arrays
-        poses = draw_poses(grid, given.seed + 1)
-        for lidar in MAP_LIDARS:
-            spec = load_lidar(lidar)
-            directions = np.ascontiguousarray(spec.directions.T)
-            beams = make_beams(directions, spec.angle_min, spec.angle_increment)
-            about = (spec.range_max, grid.arrays)
-            exact, exact_speed = scan_map(beams, poses, *about, True)
-            beside = poses.copy()
-            beside[:, 0] += RESOLUTION if given.control == "shifted" else 0.0
-            walk = given.control == "slow"
-            baked, baked_speed = scan_map(beams, beside, *about, walk)
-            error = baked.astype(np.float64) - exact
-            rows.append(
-                {
-                    "map": name,
-                    "range_max_m": spec.range_max,
-                    "exact_scans_per_s": round(exact_speed),
-                    "baked_scans_per_s": round(baked_speed),
-                    "ratio": baked_speed / exact_speed,
-                    "rmse_m": float(np.sqrt((error**2).mean())),
-                    "beams_off": float((np.abs(error) > 1e-3).mean()),
-                    "table_bytes": squares.nbytes,
-                }
-            )
-    return {"rows": rows}
-
-
-def judge_maps(result: Result) -> list[str]:
-    return [
-        line
-        for row in result["rows"]
-        for line in missed_bars(
-            row, MAP_BARS, f"{row['map']}, {row['range_max_m']:g} m: "
-        )
-    ]
 
 
 # Steps over ROS 2
@@ -749,16 +664,6 @@ BENCHMARKS = {
         },
         short="--scans 64 --scenes 4 --repeats 2 --without-peers",
         unsettled=("share of",),
-    ),
-    "map_lidar": Benchmark(
-        measure_maps,
-        judge_maps,
-        {
-            "shifted": Control("a cell: the map that is jumped through", "RMSE"),
-            "slow": Control("the jumps: the walk stands in", "the walk's speed"),
-        },
-        {"seed": 0},
-        unsettled=("the walk's speed",),
     ),
     "ros_lockstep": Benchmark(
         measure_lockstep,

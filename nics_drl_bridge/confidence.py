@@ -1,7 +1,6 @@
-"""Rates and means with their 95 % intervals, and comparisons of pairs."""
+"""Rates and means with their 95 % intervals."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,27 +44,6 @@ def estimate_rate(hits: int, trials: int) -> ConfidenceInterval:
     # If all trials agree, rounding must not move the bound away from 0 or 1.
     low = 0.0 if hits == 0 else middle - half
     return ConfidenceInterval(share, low, 1.0 if hits == trials else middle + half)
-
-
-@dataclass(frozen=True)
-class PairedComparison:
-    """What the same episodes show of two simulators, or two policies."""
-
-    points: float  # success of the second less that of the first [percentage points]
-    lost: int  # episodes that succeeded in the first alone
-    gained: int  # episodes that succeeded in the second alone
-    p: float  # probability of such a difference, or a larger one, by chance
-
-
-def compare_pairs(first: Sequence[bool], second: Sequence[bool]) -> PairedComparison:
-    """Compares the successes of the same episodes by McNemar's exact test (1947)."""
-    pairs = list(zip(first, second, strict=True))
-    lost = sum(before and not after for before, after in pairs)
-    gained = sum(after and not before for before, after in pairs)
-    points = 100.0 * (gained - lost) / len(pairs) if pairs else math.nan
-    # If chance alone decides, each of the unequal pairs is lost or gained like a coin toss.
-    tail = float(special.bdtr(min(lost, gained), lost + gained, 0.5))
-    return PairedComparison(points, lost, gained, min(1.0, 2.0 * tail))
 
 
 def estimate_mean(values: ArrayLike) -> ConfidenceInterval:

@@ -24,7 +24,6 @@ except ImportError:  # Windows
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
 _POSIX = hasattr(os, "O_DIRECTORY")  # Windows can't open folders
-_BINARY = getattr(os, "O_BINARY", 0)  # only on Windows
 
 
 def _fsync(path: Path) -> None:
@@ -44,29 +43,17 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
     """Writes a file like `write_bytes`, but in parts, so that it need not fit into memory."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with _name_path_in_errors(path):
-        remove_leftovers(path.parent)
-        temporary, descriptor = _begin_file(path)
-        try:
-            with os.fdopen(descriptor, "wb") as file:
-                file.writelines(parts)
-                file.flush()
-                os.fsync(file.fileno())
-                if _POSIX:  # while the lock still shows that the writer is alive
-                    os.replace(temporary, path)
-            if not _POSIX:  # Windows can't rename an open file
-                os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
-    _fsync(path.parent)
+    with (
+        _name_path_in_errors(Path(path)),
+        write_whole_file(path) as temporary,
+        temporary.open("wb") as file,
+    ):
+        file.writelines(parts)
 
 
-# An unfinished file or folder has a hidden name next to its final path. Its writer holds a lock
-# on it, which the system releases when the writer ends, even if it crashes. `tempfile` would make
-# files that only their owner can read; here the umask applies.
+# What is unfinished lies in a folder with a hidden name next to the final path. Its writer holds a
+# lock on the folder, which the system releases when the writer ends, even if it crashes. `tempfile`
+# would make files that only their owner can read; here the umask applies.
 
 UNFINISHED = "unfinished"
 REPLACED = "replaced"
@@ -78,20 +65,11 @@ def make_hidden_name(path: Path, ending: str = "") -> Path:
     return path.parent / f".{path.name}.{secrets.token_hex(4)}{ending and f'.{ending}'}"
 
 
-def _begin_file(path: Path) -> tuple[Path, int]:
-    """Makes a hidden file next to a path; returns it and its descriptor, which holds the lock."""
-    while True:
-        temporary = make_hidden_name(path, UNFINISHED)
-        descriptor = os.open(
-            temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | _BINARY, 0o666
-        )
-        if _lock_new(temporary, descriptor):
-            return temporary, descriptor
-        os.close(descriptor)
-
-
 def begin_folder(path: Path) -> tuple[Path, int | None]:
-    """Makes a hidden folder like `_begin_file`; the descriptor is None on Windows."""
+    """Makes a hidden folder next to a path; returns it and its descriptor, which holds the lock.
+
+    The descriptor is None on Windows.
+    """
     while True:
         temporary = make_hidden_name(path, UNFINISHED)
         temporary.mkdir()
@@ -105,7 +83,7 @@ def begin_folder(path: Path) -> tuple[Path, int | None]:
 
 
 def _lock_new(path: Path, descriptor: int) -> bool:
-    """Locks a new file or folder; False if another process removed it as a leftover."""
+    """Locks a new folder; False if another process removed it as a leftover."""
     if fcntl is None:
         return True
     # On a file system without locks, leftovers are not removed, so no lock is needed.
@@ -164,19 +142,27 @@ def _remove_if_left(path: Path) -> None:
 
 @contextmanager
 def write_whole_file(path: str | Path) -> Iterator[Path]:
-    """Yields a temporary path for a library that writes files itself; renames it to `path`.
+    """Yields a temporary path of the same name; fsyncs it and renames it to `path`.
 
-    The temporary path has the same suffix. If the block raises, nothing is left behind.
+    If the block raises, nothing is left behind.
     """
     path = Path(path)
+    with _make_hidden_folder(path) as folder:
+        yield folder / path.name
+        _fsync(folder / path.name)
+        os.replace(folder / path.name, path)
+        _fsync(path.parent)
+
+
+@contextmanager
+def _make_hidden_folder(path: Path) -> Iterator[Path]:
+    """Yields a locked hidden folder next to a path; removes what killed writers left there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with _name_path_in_errors(path):
         remove_leftovers(path.parent)
         folder, descriptor = begin_folder(path)
     try:
-        yield folder / path.name
-        os.replace(folder / path.name, path)
-        _fsync(path.parent)
+        yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         if descriptor is not None:
@@ -254,20 +240,12 @@ def write_whole_folder(
     Raises ConfigError, see `check_folder`.
     """
     path = check_folder(path, marker, sign)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with _name_path_in_errors(path):
-        remove_leftovers(path.parent)
-        temporary, descriptor = begin_folder(path)
-    try:
+    with _make_hidden_folder(path) as temporary:
         yield temporary
         if path.is_dir():
             _keep_others(path, temporary, is_own)
         sync_folder(temporary)
         _swap(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if descriptor is not None:
-            os.close(descriptor)
 
 
 def _keep_others(old: Path, new: Path, is_own: Callable[[str], bool]) -> None:

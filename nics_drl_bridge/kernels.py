@@ -4,7 +4,7 @@ numba itself checks only the file that defines a function. Here, cached code is 
 module changes, or any module that it imports, directly or not, from this package or from the
 folder of a user's own kernel.
 
-A wheel may carry machine code for `TARGET`, which most x86 machines run; it is loaded where the
+A wheel may carry machine code for `TARGET`, which most x86 machines run; it is loaded if the
 cache has none. On other machines, and after an edit, the kernels are compiled as usual.
 """
 
@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 from llvmlite import binding as llvm
-from llvmlite import ir
 from numba import types
 from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
@@ -31,18 +30,16 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
 from numba.experimental import structref
-from numba.extending import intrinsic
-from numba.np.arrayobj import make_array
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.status import REPEATED_S, STATUS
 
 PACKAGE = Path(__file__).parent
 TARGET = "x86-64-v3"
-# what it has beyond the first x86-64, by LLVM's names
+# CPU features of `TARGET` beyond the first x86-64, by LLVM's names
 TARGET_FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
-CARRIED = PACKAGE / "machine_code"  # of the wheel; no folder in a checkout
-PATIENCE_S = 2.0  # longer compiling is announced on standard error
+CARRIED = PACKAGE / "machine_code"  # in the wheel; a checkout has no such folder
+PATIENCE_S = 2.0  # if compiling takes longer, standard error says so
 SECONDS_EACH = 0.5  # typical time to compile a kernel with its helpers [s]
 TRUSTED_AFTER = 5  # kernels after which the measured pace weighs as much
 KERNELS: list[Any] = []  # numba dispatchers of all kernels imported so far
@@ -90,31 +87,11 @@ def kernel(
 def bind(compiled: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
     """Binds a kernel to arguments that change in place: a call then takes a third of the time.
 
-    numba otherwise looks at the types of all arguments in each call.
+    Otherwise numba determines the types of all arguments in each call.
     """
     dispatcher: Any = compiled
     types_of_arguments = tuple(map(dispatcher.typeof_pyval, arguments))
     return partial(dispatcher.compile(types_of_arguments), *arguments)
-
-
-@intrinsic
-def prefetch(_typing: Any, array: Any, index: Any) -> Any:
-    """Prefetches array[index] (n,) into the CPU cache, so that a kernel need not wait for it."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = make_array(signature.args[0])(context, builder, args[0]).data
-        integer = ir.IntType(32)
-        byte = ir.IntType(8).as_pointer()
-        place = builder.bitcast(builder.gep(data, [args[1]]), byte)
-        kind = ir.FunctionType(ir.VoidType(), [byte, integer, integer, integer])
-        ask = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
-        read = integer(0)
-        keep = integer(3)
-        data_cache = integer(1)
-        builder.call(ask, [place, read, keep, data_cache])
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp), generate
 
 
 class _InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
@@ -462,5 +439,5 @@ structref.define_proxy(Packed, PackedType, ["content"])
 
 @kernel(allocates=True)
 def pack(content: Any) -> Any:
-    """Make one argument of a NamedTuple."""
+    """Packs a NamedTuple into one argument."""
     return Packed(content)

@@ -100,11 +100,6 @@ def _count_legend_columns(labels: Sequence[str], width: float) -> int:
     return len(labels) if sum(widths) <= letters else max(1, int(letters / max(widths)))
 
 
-def _count_legend_rows(labels: Sequence[str], width: float) -> int:
-    """Returns the number of rows of a legend that fits into a width [inch]."""
-    return -(-len(labels) // _count_legend_columns(labels, width)) if labels else 0
-
-
 def _compute_width(panel: Panel, columns: int = 1) -> float:
     """Returns the width [inch] of a figure whose panels have a fixed size."""
     return columns * (panel.left + panel.width + RIGHT_IN)
@@ -136,28 +131,37 @@ def render_png(
         frame_legend = axes.get_legend()
         if frame_legend is not None:
             frame_legend.set_frame_on(False)
-        place_in_grid = axes.get_subplotspec()
-        if place_in_grid is not None:
-            fraction = len(place_in_grid.colspan) / place_in_grid.get_gridspec().ncols
-            letters = int(LETTERS_PER_IN * fraction * figure.get_figwidth())
-            title = (fill(line, letters) for line in axes.get_title().splitlines())
-            axes.set_title("\n".join(title))
+        _wrap_title(axes, figure.get_figwidth())
     rows = 0
     if legend is not None:
-        handles, labels = legend.get_legend_handles_labels()
-        width = figure.get_figwidth()
-        fills = panel is None  # then the axes make room for the legend
-        place: LegendPlace = "outside upper center" if fills else "upper center"
-        if labels:
-            figure.legend(
-                handles, labels, loc=place, ncols=_count_legend_columns(labels, width)
-            )
-        rows = _count_legend_rows(labels, width)
+        # Without a panel, the axes make room for the legend.
+        place: LegendPlace = "outside upper center"
+        rows = _add_legend(figure, legend, "upper center" if panel else place)
     if panel is not None:
         _place_panels(figure, panel, rows)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
+
+
+def _wrap_title(axes: Axes, width: float) -> None:
+    """Wraps the title of axes in a grid of a width [inch]."""
+    place = axes.get_subplotspec()
+    if place is not None:
+        fraction = len(place.colspan) / place.get_gridspec().ncols
+        letters = int(LETTERS_PER_IN * fraction * width)
+        lines = (fill(line, letters) for line in axes.get_title().splitlines())
+        axes.set_title("\n".join(lines))
+
+
+def _add_legend(figure: Figure, source: Axes, place: LegendPlace) -> int:
+    """Adds the legend of one of the axes to the figure; returns its number of rows."""
+    handles, labels = source.get_legend_handles_labels()
+    if not labels:
+        return 0
+    columns = _count_legend_columns(labels, figure.get_figwidth())
+    figure.legend(handles, labels, loc=place, ncols=columns)
+    return -(-len(labels) // columns)
 
 
 def _count_grid(figure: Figure) -> tuple[int, int]:

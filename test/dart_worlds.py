@@ -52,7 +52,7 @@ def compare_readings(
     scanner = make_scanner(lidar, list(dict.fromkeys(shapes)), "exact")
     bodies = scanner.place(shapes, np.array(places) + moved)
     _world, nodes = read_by_dart(path)  # without the world, its nodes end
-    group = make_group(dartpy, nodes)
+    group = make_group(nodes)
     rng = np.random.default_rng(seed)
     middles = np.array(places)[:, :2]
     points = rng.uniform(middles.min(axis=0), middles.max(axis=0), (TRIES, 2))
@@ -62,7 +62,7 @@ def compare_readings(
     same = hits = 0
     for point in free[:poses]:
         pose = np.array([*point, rng.uniform(-np.pi, np.pi)])
-        theirs = cast_scan(dartpy, group, lidar, pose, HEIGHT)
+        theirs = cast_scan(group, lidar, pose, HEIGHT)
         ours = scanner.scan(pose, bodies)[0]
         same += int(np.isclose(theirs, ours, rtol=0.0, atol=SAME_M).sum())
         hits += int(np.isfinite(theirs).sum())

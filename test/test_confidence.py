@@ -8,7 +8,6 @@ from scipy import stats
 
 from nics_drl_bridge.confidence import (
     bound_rate,
-    compare_pairs,
     estimate_mean,
     estimate_rate,
 )
@@ -25,18 +24,6 @@ def test_the_interval_of_a_rate_is_wilsons(hits, trials):
         (wanted.low, wanted.high), abs=1e-12
     )
     assert found.low <= found.value <= found.high
-
-
-@pytest.mark.parametrize(("lost", "gained"), [(0, 0), (5, 0), (8, 1), (3, 3), (2, 9)])
-def test_pairs_are_compared_by_mcnemars_exact_test(lost, gained):
-    first = [True] * lost + [False] * gained + [True] * 20 + [False] * 4
-    second = [False] * lost + [True] * gained + [True] * 20 + [False] * 4
-    found = compare_pairs(first, second)
-    unequal = lost + gained
-    wanted = stats.binomtest(lost, unequal).pvalue if unequal else 1.0
-    assert (found.lost, found.gained) == (lost, gained)
-    assert found.p == pytest.approx(wanted)
-    assert found.points == pytest.approx(100.0 * (gained - lost) / len(first))
 
 
 def test_the_interval_of_a_mean_is_students():

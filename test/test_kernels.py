@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -106,15 +107,12 @@ def test_kernels_are_compiled_once_and_again_after_an_edit_of_what_they_are_made
     # A division by zero is inf.
     assert ask(package) == ([20.0, -1.0, float("inf")], [1, 1])
     assert ask(package) == ([20.0, -1.0, float("inf")], [0, 0])
-    edit("low_kernels.py", "x + STEP", "x - STEP")
-    assert ask(package) == ([0.0, -1.0, float("inf")], [1, 0])
     edit("constants.py", "1.0", "3.0")
-    assert ask(package) == ([-20.0, -1.0, float("inf")], [1, 0])
-    assert ask(package)[1] == [0, 0]
+    assert ask(package) == ([40.0, -1.0, float("inf")], [1, 0])
     files = len(list(package.rglob("*.nbi")))
     edit("high_kernels.py", "\n@kernel\ndef high", "\n\n\n@kernel\ndef high")
     edit("high_kernels.py", "10.0 *", "20.0 *")
-    assert ask(package) == ([-40.0, -1.0, float("inf")], [1, 0])
+    assert ask(package) == ([80.0, -1.0, float("inf")], [1, 0])
     assert len(list(package.rglob("*.nbi"))) == files  # a kernel that moved leaves none
 
 
@@ -132,21 +130,22 @@ def test_machine_code_that_a_wheel_carries_is_loaded_until_its_source_changes(pa
     assert ask(package) == ([40.0, -1.0, float("inf")], [1, 0])
 
 
-@pytest.mark.slow
-def test_a_class_of_arguments_may_get_another_name(package):
-    named = "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    one: float\n"
-    call = LOW.replace("x + STEP", "x.one + STEP") + "\nlow(Pair(1.0))\n"
-    file = package / "low_kernels.py"
-    for name in ("Pair", "Couple"):
-        file.write_text((named + call).replace("Pair", name))
-        code = "import nics_drl_bridge.low_kernels"
-        subprocess.run([sys.executable, "-c", code], cwd=package.parent, check=True)
-
-
 def index(folder, version="1"):
     made = kernels._Index(str(folder), "file", "stamp")
     made._version += version
     return made
+
+
+def test_a_class_of_arguments_may_get_another_name(tmp_path, monkeypatch):
+    module = ModuleType("renamed")
+    module.Pair = type("Pair", (), {"__module__": "renamed"})
+    monkeypatch.setitem(sys.modules, "renamed", module)
+    index(tmp_path).save(module.Pair, "code")
+    assert index(tmp_path).load(module.Pair) == "code"
+    del module.Pair
+    assert index(tmp_path).load("other") is None
+    index(tmp_path).save("other", "other code")
+    assert index(tmp_path).load("other") == "other code"
 
 
 def test_of_two_processes_that_save_at_once_neither_gets_the_others_code(
@@ -201,19 +200,6 @@ def test_a_kernel_of_ones_own_is_made_of_the_files_beside_it(tmp_path):
     names = {each.name for each in found if tmp_path in each.parents}
     assert names - {"__init__.py"} == {"helpers.py", "more.py", "consts.py", "deep.py"}
     assert kernels.PACKAGE / "geometry.py" in found
-
-
-@kernels.kernel
-def _asked(values, index):
-    kernels.prefetch(values, index)
-    return values[0] + values[values.shape[0] - 1]
-
-
-@pytest.mark.parametrize("index", [0, 2, -1, 10**12])
-def test_asking_for_any_place_of_an_array_changes_nothing(index):
-    values = np.array([1.0, 2.0, 4.0])
-    assert _asked(values, index) == 5.0
-    assert values.tolist() == [1.0, 2.0, 4.0]
 
 
 def test_a_bound_kernel_takes_what_its_arrays_hold_when_it_is_called():

@@ -114,9 +114,10 @@ assert nics("evaluate", "straight", "--episodes", "1", "--out", {str(tmp_path)!r
     ("module", "what", "library", "extra"),
     [
         ("env.pettingzoo_env", "BridgeParallelEnv", "pettingzoo", "multi"),
-        ("policy.train.vec_env", "TrainVecEnv", "stable_baselines3", "train"),
         ("policy.train.export", "the export of a policy", "onnx", "deploy"),
         ("policy.train.export", "the export of a policy", "torch", "train"),
+        ("extras.dart", "DART", "dartpy", "dart"),
+        ("extras.mujoco", "MuJoCo", "mujoco", "mujoco"),
     ],
 )
 def test_a_module_whose_extra_is_missing_names_it(

@@ -45,9 +45,15 @@ def normals(seeds, counters, count):
     return out
 
 
+@pytest.fixture(scope="module")
+def thousands():
+    """Normals (30, 60, 1080) of seeds, counters and draws."""
+    return normals(30, 60, 1080).astype(np.float64)
+
+
 @pytest.mark.slow
-def test_normals_by_the_thousand_are_standard_normal_far_out_too():
-    sample = normals(30, 60, 1080).ravel().astype(np.float64)
+def test_normals_by_the_thousand_are_standard_normal_far_out_too(thousands):
+    sample = thousands.ravel()
     assert stats.kstest(sample, "norm").pvalue > 1e-3
     assert sample.std() == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * sample.size))
     assert stats.kurtosis(sample) == pytest.approx(
@@ -75,8 +81,8 @@ def test_sums_of_two_numbers_of_the_pool_are_standard_normal_within_a_50000th():
 
 
 @pytest.mark.slow
-def test_signs_of_draws_are_independent_of_each_other_and_of_their_sizes():
-    sample = normals(30, 60, 1056).astype(np.float64).reshape(-1, random.RUN)
+def test_signs_of_draws_are_independent_of_each_other_and_of_their_sizes(thousands):
+    sample = thousands[..., :1056].reshape(-1, random.RUN)
     apart = np.corrcoef(sample, rowvar=False)[np.triu_indices(random.RUN, 1)]
     assert np.abs(apart).max() < 5.0 / np.sqrt(len(sample))
 
@@ -119,7 +125,6 @@ def test_draws_have_their_distribution_and_are_not_correlated(function, name):
 
 
 @pytest.mark.slow
-def test_normals_of_neighbours_in_scan_counter_and_seed_are_not_correlated():
-    sample = normals(30, 60, 1080).astype(np.float64)
-    assert_uncorrelated(sample)
-    assert_uncorrelated(np.abs(sample) - np.sqrt(2.0 / np.pi))
+def test_normals_of_neighbours_in_scan_counter_and_seed_are_not_correlated(thousands):
+    assert_uncorrelated(thousands)
+    assert_uncorrelated(np.abs(thousands) - np.sqrt(2.0 / np.pi))

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measuring.environments import clean, python_with, wait_for
-from nics_drl_bridge import geometry
-from nics_drl_bridge.extras.mujoco.machines import load_mujoco
+from nics_drl_bridge import extensions, geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
@@ -139,7 +138,9 @@ def scan_in_mujoco(spec: LidarSpec, path: Array) -> NDArray[np.float32]:
     Raises:
         ConfigError: MuJoCo is not installed.
     """
-    mujoco = load_mujoco()
+    extensions.require("MuJoCo", "mujoco")
+    import mujoco
+
     geoms = [describe_side(side) for side in WALLS]
     for shape, pose in zip(OBSTACLES, POSES, strict=True):
         geoms += list_sides(shape, pose)

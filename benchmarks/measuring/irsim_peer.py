@@ -16,11 +16,9 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-STEP_SAMPLES = 5
-"""Of a step, a scan, and a step without its scan, in each scene that a round goes through."""
-STEPS_S = 0.5
-"""That a round spends on them at least [s]."""
-CHUNKS = {"period_with_one_scan": 50, "period_with_ten_scans": 25}
+SCANS = 20
+"""That are timed in a round, each in the next scene."""
+PERIODS = 50
 """Control periods that are timed together; the first begins an episode in the next scene."""
 
 
@@ -74,11 +72,12 @@ class Simulator:
                 str(file), display=False, disable_all_plot=True, log_level="ERROR"
             )
         self.compiled = getattr(self.env, "_cpp", None)
-        owner = self.env if self.compiled is None else self.compiled
         # What their step calls, so that a scan alone is the same work as the scan within a step.
-        name = "_objects_sensor_step" if self.compiled is None else "_fast_sensor_step"
-        self.owner = owner
-        self.name = name
+        self.scan = (
+            self.env._objects_sensor_step
+            if self.compiled is None
+            else self.compiled._fast_sensor_step
+        )
 
     def begin(self, scene: dict) -> None:
         """Begins an episode in another scene, by no more than it takes: `reset` would draw."""
@@ -90,21 +89,9 @@ class Simulator:
             self.compiled.build()
         self.env.refresh()
 
-    def scan(self) -> None:
-        """The scan of a step, alone."""
-        getattr(self.owner, self.name)()
-
     def step(self, action: np.ndarray) -> None:
         """What they offer to users: a motion and a scan."""
         self.env.step(action)
-
-    def step_without_scan(self, action: np.ndarray) -> None:
-        """The same but for the scan."""
-        setattr(self.owner, self.name, lambda: None)
-        try:
-            self.env.step(action)
-        finally:
-            delattr(self.owner, self.name)
 
     def move(self, action: np.ndarray) -> None:
         """A motion and its collision by their inner functions, past what they offer to users."""
@@ -123,13 +110,10 @@ class Simulator:
 class Task:
     """Control periods of the task by random commands, one episode after the other."""
 
-    def __init__(
-        self, simulator: Simulator, scenes: list, about: dict, one_scan: bool
-    ) -> None:
+    def __init__(self, simulator: Simulator, scenes: list, about: dict) -> None:
         self.simulator = simulator
         self.scenes = scenes
         self.about = about
-        self.one_scan = one_scan
         self.rng = np.random.default_rng(0)
         self.at = -1
         self.periods = 0
@@ -165,9 +149,8 @@ class Task:
     def drive(self, action: np.ndarray) -> None:
         """The motion of a control period, and its scans."""
         substeps = self.about["substeps"]
-        ahead = self.simulator.move if self.one_scan else self.simulator.step
         for _ in range(substeps - 1):
-            ahead(action)
+            self.simulator.move(action)
             if self.simulator.touched:
                 break
         self.simulator.step(action)
@@ -217,13 +200,7 @@ class Readings:
         about = given["about"]
         self.simulator = Simulator(self.scenes[0], about)
         self.at = 0
-        self.rng = np.random.default_rng(1)
-        self.tasks = {
-            name: Task(
-                Simulator(self.scenes[0], about), self.scenes, about, "one" in name
-            )
-            for name in CHUNKS
-        }
+        self.task = Task(Simulator(self.scenes[0], about), self.scenes, about)
 
     def ranges(self) -> list[list[float]]:
         """Of a scan at the start in each scene [m]."""
@@ -236,48 +213,29 @@ class Readings:
             )
         return found
 
-    def steps(self) -> dict[str, list[float]]:
-        """A scan, and a step with and without it, in turn and at the same places [s]."""
-        times: dict[str, list[float]] = {
-            "scan": [],
-            "step": [],
-            "step_without_scan": [],
-        }
-        until = time.perf_counter() + STEPS_S
-        while time.perf_counter() < until:
+    def time_scans(self) -> list[float]:
+        """Times of a scan alone, once its scene is in the caches [s]."""
+        times = []
+        for _ in range(SCANS):
             self.simulator.begin(self.scenes[self.at % len(self.scenes)])
             self.at += 1
-            for k in range(1 + STEP_SAMPLES):
-                action = np.array(
-                    [[self.rng.uniform(0.0, 1.0)], [self.rng.uniform(-2.0, 2.0)]]
-                )
-                calls = {
-                    "scan": (self.simulator.scan,),
-                    "step": (self.simulator.step, action),
-                    "step_without_scan": (self.simulator.step_without_scan, action),
-                }
-                for name in self.rng.permutation(
-                    list(calls)
-                ):  # each after each of the others
-                    seconds = timed(*calls[name])
-                    times[name] += [seconds] if k else []  # the first fills caches
+            self.simulator.scan()
+            times.append(timed(self.simulator.scan))
         return times
 
     def round(self) -> dict[str, list[float]]:
         """Times of every reading [s]."""
-        times = self.steps()
-        for name, task in self.tasks.items():
-            times[name] = [timed(task.periods_of, CHUNKS[name]) / CHUNKS[name]]
+        times = {"scan": self.time_scans()}
+        times["period"] = [timed(self.task.periods_of, PERIODS) / PERIODS]
         return times
 
     def drove(self) -> dict[str, float]:
         """What shows that the robots of the tasks moved and saw."""
-        tasks = list(self.tasks.values())
-        periods = max(1, sum(task.periods for task in tasks))
+        task = self.task
         return {
-            "moved_m_per_period": sum(task.moved for task in tasks) / periods,
-            "beams_changed_per_period": sum(task.changed for task in tasks) / periods,
-            "episodes": sum(task.ended for task in tasks),
+            "moved_m_per_period": task.moved / task.periods,
+            "beams_changed_per_period": task.changed / task.periods,
+            "episodes": task.ended,
         }
 
 

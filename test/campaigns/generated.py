@@ -24,7 +24,7 @@ from campaign import (
     tell,
 )
 from fidelity import average_drives
-from transfer import PHYSICS_ENGINES, find_engines, make_simulator
+from transfer import SIMULATORS, find_engines, make_simulator
 
 from nics_drl_bridge.extras.physics.simulator import PhysicsSimulator
 from nics_drl_bridge.generator import builtin_model
@@ -119,7 +119,7 @@ def judge(result: Result) -> list[str]:
 
 
 OPTIONS = {
-    "engines": some_of(tuple(PHYSICS_ENGINES)),
+    "engines": some_of(tuple(SIMULATORS)),
     "robots": some_of(ROBOTS),
     "train": (120.0, "recorded seconds"),
     "unseen": (30.0, "seconds of each unseen drive"),

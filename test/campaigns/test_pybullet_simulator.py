@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,19 +37,20 @@ from .campaign import FOLDER
 pytestmark = pytest.mark.campaign
 
 
+class PybulletEngine(Engine):
+    """The campaigns' own engine."""
+
+    def find(self, kind: str) -> Any:
+        """See `Engine`."""
+        return getattr(import_module("parts.pybullet_simulator"), kind)
+
+
 @pytest.fixture
 def engine(monkeypatch) -> Engine:
     monkeypatch.setattr(sys, "path", [str(FOLDER), *sys.path])
-    from parts.pybullet_simulator import PHYSICS, PybulletSimulator, load_pybullet
-
-    return Engine(
+    return PybulletEngine(
         name="PyBullet",
-        extra="",
         library="pybullet",
-        load=load_pybullet,
-        robot=None,
-        simulator=PybulletSimulator,
-        physics=PHYSICS,
         rest_error=3e-3,
         encoder_error=0.02,
         skid_error=0.1,

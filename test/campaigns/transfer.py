@@ -14,10 +14,11 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
+from importlib import import_module
 from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
@@ -35,19 +36,12 @@ from campaign import (
 )
 from measuring.evaluations import Standing
 from measuring.perturbations import open_real_model
-from parts.pybullet_simulator import PHYSICS as PYBULLET_PHYSICS
-from parts.pybullet_simulator import PybulletSimulator, load_pybullet
+from scipy import stats
 
 from nics_drl_bridge.commands.episodes import Conditions, make_env
-from nics_drl_bridge.confidence import compare_pairs, estimate_rate
+from nics_drl_bridge.confidence import estimate_rate
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.extras.dart.scenery import load_dart
-from nics_drl_bridge.extras.dart.simulator import PHYSICS as DART_PHYSICS
-from nics_drl_bridge.extras.dart.simulator import DartSimulator
-from nics_drl_bridge.extras.mujoco.machines import load_mujoco
-from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
-from nics_drl_bridge.extras.physics.machines import Physics
 from nics_drl_bridge.gate.assurance.results import cluster_seeds
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel
@@ -58,13 +52,12 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 FAST = "fast"
-# by name: the simulator, its usual physics, and what says what to install
-PHYSICS_ENGINES: dict[str, tuple[Any, Physics, Callable[[], Any]]] = {
-    "mujoco": (MujocoSimulator, Physics(), load_mujoco),
-    "dart": (DartSimulator, DART_PHYSICS, load_dart),
-    "pybullet": (PybulletSimulator, PYBULLET_PHYSICS, load_pybullet),
+SIMULATORS = {
+    "mujoco": "nics_drl_bridge.extras.mujoco.simulator",
+    "dart": "nics_drl_bridge.extras.dart.simulator",
+    "pybullet": "parts.pybullet_simulator",
 }
-ENGINES = (FAST, *PHYSICS_ENGINES)
+ENGINES = (FAST, *SIMULATORS)
 WORLDS = (
     "arena",
     "circles",
@@ -109,16 +102,18 @@ def make_simulator(
 
     Raises ConfigError if the engine is not installed.
     """
-    make, usual, _ = PHYSICS_ENGINES[engine]
-    changed = replace(usual, **physics)
-    return make(model, world, physics=changed, randomisation=drawn)
+    module = import_module(SIMULATORS[engine])
+    changed = replace(module.PHYSICS, **physics)
+    kind = getattr(module, f"{engine.capitalize()}Simulator")
+    simulator: FastSimulator = kind(model, world, physics=changed, randomisation=drawn)
+    return simulator
 
 
 def find_missing(engine: str) -> str:
     """Returns why an engine can't be driven here; nothing if it can."""
     try:
-        if engine != FAST:
-            PHYSICS_ENGINES[engine][-1]()
+        if engine in SIMULATORS:
+            import_module(SIMULATORS[engine])
     except ConfigError as error:
         return str(error)
     return ""
@@ -271,9 +266,20 @@ def compare_engines(
         }
         if FAST in engines and engine != FAST:
             fast = [ended[robot, FAST][seed]["result"] == "success" for seed in seeds]
-            figures |= asdict(compare_pairs(fast, success))
+            figures |= compare_pairs(fast, success)
         compared[robot][engine] = figures
     return compared
+
+
+def compare_pairs(first: Sequence[bool], second: Sequence[bool]) -> dict[str, float]:
+    """Compares the successes of the same episodes by McNemar's exact test (1947)."""
+    pairs = list(zip(first, second, strict=True))
+    lost = sum(before and not after for before, after in pairs)
+    gained = sum(after and not before for before, after in pairs)
+    # If chance alone decides, each of the unequal pairs is lost or gained like a coin toss.
+    p = stats.binomtest(lost, lost + gained).pvalue if lost + gained else 1.0
+    points = 100.0 * (gained - lost) / max(len(pairs), 1)
+    return {"points": points, "lost": lost, "gained": gained, "p": float(p)}
 
 
 def judge(result: Result) -> list[str]:

@@ -102,6 +102,8 @@ def test_without_in_an_evaluation_leaves_out_where_it_can_not_run_in_one_line(
     pytest.importorskip("rclpy")
     if lacking == "mujoco":
         monkeypatch.setitem(sys.modules, "mujoco", None)
+        for name in [name for name in sys.modules if "extras.mujoco" in name]:
+            monkeypatch.delitem(sys.modules, name)
     elif lacking:
         there = extensions.find_spec
         monkeypatch.setattr(

@@ -1,6 +1,5 @@
 """Nodes of other physics engines: the same robots over topics as in this process."""
 
-import sys
 from importlib import import_module
 
 import gymnasium
@@ -22,11 +21,8 @@ pytestmark = pytest.mark.ros
 
 TIMEOUT_S = 60.0
 SEEDS = (11,)
-# node -> library, its extra, and the name in sentences
-ENGINES = {
-    "dart_node": ("dartpy", "dart", "DART"),
-    "mujoco_node": ("mujoco", "mujoco", "MuJoCo"),
-}
+# node -> library, name
+ENGINES = {"dart_node": ("dartpy", "DART"), "mujoco_node": ("mujoco", "MuJoCo")}
 
 
 class EngineBackend(SimBackend):
@@ -77,7 +73,7 @@ def test_whole_episodes_over_topics_reach_the_goal_as_in_this_process(node, robo
     there = gymnasium.make(
         NAVIGATION, backend="dds", backend_options=options, **arguments
     )
-    backend = EngineBackend(model, world, ENGINES[name][2])
+    backend = EngineBackend(model, world, ENGINES[name][1])
     here = gymnasium.wrappers.TimeLimit(BridgeEnv(backend, **arguments), EPISODE_STEPS)
     policy = make_policy("dynamic_window", there.unwrapped.task)
     try:
@@ -89,15 +85,3 @@ def test_whole_episodes_over_topics_reach_the_goal_as_in_this_process(node, robo
     for one, other in zip(over_topics, in_process, strict=True):
         assert np.array_equal(one.estimate, other.estimate)
         assert np.abs(one.path - other.path).max() < 1e-12
-
-
-@pytest.mark.parametrize("node", ENGINES)
-def test_without_its_engine_a_node_ends_with_one_sentence(
-    node, launch, domain_id, monkeypatch
-):
-    library, extra, name = ENGINES[node]
-    monkeypatch.setitem(sys.modules, library, None)
-    started = launch(node, domain_id)
-    assert started.wait() == 2
-    fix = f"run pip install 'nics_drl_bridge[{extra}]'."
-    assert started.lines[-1] == f"{name} is not installed; {fix}"

@@ -17,6 +17,7 @@ from nics_drl_bridge.config import validate
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.task import discrete_commands
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.physics.machines import Physics, design_machine
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import generate
 from nics_drl_bridge.policy.policies import make_policy
@@ -306,12 +307,10 @@ def test_it_has_limits_and_is_drawn_on_three_wheels():
 
 
 def test_mujoco_says_that_it_has_no_machine_of_it():
-    from nics_drl_bridge.extras.mujoco.machines import build_machine
-
     with pytest.raises(
         ConfigError, match="'tricycle': MuJoCo has no machine of the kind 'tricycl"
     ):
-        build_machine(load_robot(NEW))
+        design_machine(load_robot(NEW), Physics(), "MuJoCo")
 
 
 @pytest.mark.parametrize("name", ["tank", "mecanum"])

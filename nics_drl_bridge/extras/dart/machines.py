@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import dartpy
 import numpy as np
 
 from nics_drl_bridge.errors import ConfigError
@@ -18,6 +19,8 @@ from nics_drl_bridge.extras.physics.machines import (
     Roller,
     Wheel,
     place_rollers,
+    weigh_chassis,
+    weigh_wheel,
 )
 from nics_drl_bridge.interface import Array
 
@@ -31,34 +34,29 @@ class DartBody:
     """A robot that is not yet in a world."""
 
     skeleton: Any
-    joints: list[Any]  # those with encoders, in the order of the machine
-    height: float  # of its root above the floor [m]
+    joints: list[Any]  # joints with encoders, in the order of the machine
+    height: float  # height of its root above the floor [m]
 
 
-def make_body(
-    dart: Any, machine: Machine, physics: Physics, file: Path | None = None
-) -> DartBody:
-    """Returns a machine's robot, read from a file if there is one. Raises ConfigError."""
+def make_body(machine: Machine, physics: Physics, file: Path | None = None) -> DartBody:
+    """Builds the robot of a machine, or reads it from a file. Raises ConfigError."""
     if file is not None:
-        return _read_robot(dart, file, machine, physics)
-    return _Builder(dart, machine, physics).build()
+        return _read_robot(file, machine, physics)
+    return _Builder(machine, physics).build()
 
 
 class _Builder:
-    def __init__(self, dart: Any, machine: Machine, physics: Physics) -> None:
-        self._dart = dart
+    def __init__(self, machine: Machine, physics: Physics) -> None:
         self._machine = machine
         self._physics = physics
 
     def build(self) -> DartBody:
         machine = self._machine
-        skeleton = self._dart.dynamics.Skeleton("robot")
+        skeleton = dartpy.dynamics.Skeleton("robot")
         _, base = skeleton.createFreeJointAndBodyNodePair()
         base.setName("base_link")
-        mass = self._physics.mass
-        squares = np.square(machine.size)
-        moment = mass * (squares.sum() - squares) / 12.0
-        self._weigh(base, mass, moment, machine.centre)
+        moment = weigh_chassis(machine, self._physics)
+        self._weigh(base, self._physics.mass, moment, machine.centre)
         if machine.castor is not None:
             self._add_castor(base, *machine.castor)
         for wheel in machine.wheels:
@@ -73,32 +71,31 @@ class _Builder:
         moment: Array,
         centre: tuple[float, ...] = (0, 0, 0),
     ) -> None:
-        inertia = self._dart.dynamics.Inertia(mass, np.array(centre), np.diag(moment))
+        inertia = dartpy.dynamics.Inertia(mass, np.array(centre), np.diag(moment))
         body.setInertia(inertia)
 
-    def _tread(self, body: Any, shape: Any) -> None:
-        scenery.let_touch(scenery.add_shape(body, shape), self._physics.friction)
+    def _add_tread(self, body: Any, shape: Any, transform: Any = None) -> None:
+        node = scenery.add_shape(body, shape, transform)
+        scenery.let_touch(node, self._physics.friction)
 
     def _add_joint(self, parent: Any, name: str, axis: Array, place: Array) -> Any:
         joint, body = parent.getSkeleton().createRevoluteJointAndBodyNodePair(parent)
         joint.setName(name)
         body.setName(f"{name}_link")
         joint.setAxis(axis)
-        transform = scenery.make_transform(self._dart, place)
+        transform = scenery.make_transform(place)
         joint.setTransformFromParentBodyNode(transform)
         return body
 
     def _add_castor(self, base: Any, behind: float, radius: float) -> None:
         joint, body = base.getSkeleton().createBallJointAndBodyNodePair(base)
         place = np.array([behind, 0.0, radius - self._machine.radius])
-        transform = scenery.make_transform(self._dart, place)
+        transform = scenery.make_transform(place)
         joint.setTransformFromParentBodyNode(transform)
         self._weigh(body, CASTOR_MASS, np.full(3, 0.4 * CASTOR_MASS * radius**2))
-        ball = self._dart.dynamics.SphereShape(radius)
-        self._tread(body, ball)
+        self._add_tread(body, dartpy.dynamics.SphereShape(radius))
 
     def _add_wheel(self, base: Any, wheel: Wheel) -> None:
-        radius = self._machine.radius
         parent = base
         place = np.array([*wheel.place, 0.0])
         if wheel.steering:
@@ -106,20 +103,13 @@ class _Builder:
             self._weigh(parent, PIVOT_MASS, np.full(3, PIVOT_INERTIA))
             place = np.zeros(3)
         body = self._add_joint(parent, wheel.name, Y, place)
-        mass = self._physics.wheel_mass
-        width = 0.4 * radius
+        radius = self._machine.radius
         if wheel.lean:
-            mass -= self._physics.rollers * ROLLER_MASS
-            radius *= 0.7
-            for roller in place_rollers(
-                self._machine.radius, self._physics.rollers, wheel.lean
-            ):
+            for roller in place_rollers(radius, self._physics.rollers, wheel.lean):
                 self._add_roller(body, roller)
         else:
-            tyre = self._dart.dynamics.SphereShape(radius)
-            self._tread(body, tyre)
-        across = mass * (3.0 * radius**2 + width**2) / 12.0
-        self._weigh(body, mass, np.array([across, 0.5 * mass * radius**2, across]))
+            self._add_tread(body, dartpy.dynamics.SphereShape(radius))
+        self._weigh(body, *weigh_wheel(wheel, self._machine, self._physics))
 
     def _add_roller(self, wheel: Any, roller: Roller) -> None:
         x, z = roller.place
@@ -127,22 +117,19 @@ class _Builder:
         name = f"{wheel.getName()}_{wheel.getNumChildBodyNodes()}"
         body = self._add_joint(wheel, name, axle, np.array([x, 0.0, z]))
         for radius, along in zip(*roller.spheres, strict=True):
-            transform = scenery.make_transform(self._dart, along * axle)
-            ball = self._dart.dynamics.SphereShape(radius)
-            scenery.let_touch(
-                scenery.add_shape(body, ball, transform), self._physics.friction
-            )
+            transform = scenery.make_transform(along * axle)
+            self._add_tread(body, dartpy.dynamics.SphereShape(radius), transform)
         self._weigh(body, ROLLER_MASS, np.full(3, roller.inertia))
 
 
-def _read_skeleton(dart: Any, path: Path) -> Any:
+def _read_skeleton(path: Path) -> Any:
     """Reads links and joints from a URDF or SDF file. Raises ConfigError."""
     if not path.is_file():
         raise ConfigError(f"robot {str(path)!r}: no such file.")
-    uri = dart.common.Uri(path.absolute().as_uri())
-    reader = dart.utils.DartLoader().parseSkeleton
+    uri = dartpy.common.Uri(path.absolute().as_uri())
+    reader = dartpy.utils.DartLoader().parseSkeleton
     if path.suffix == ".sdf":
-        reader = dart.utils.SdfParser.readSkeleton
+        reader = dartpy.utils.SdfParser.readSkeleton
     try:
         skeleton = reader(uri)
     except RuntimeError as error:
@@ -156,16 +143,16 @@ def _read_skeleton(dart: Any, path: Path) -> Any:
     return skeleton
 
 
-def _read_robot(dart: Any, path: Path, machine: Machine, physics: Physics) -> DartBody:
-    """Reads a robot from a URDF or SDF file; its wheels are found by axles and places.
+def _read_robot(path: Path, machine: Machine, physics: Physics) -> DartBody:
+    """Reads a robot from a URDF or SDF file; finds its wheels by their axles and places.
 
-    Raises ConfigError if it can't be read, or has no wheel, or several, where the machine has one.
+    Raises ConfigError if it can't be read, or unless one joint fits each joint of the machine.
     """
-    skeleton = _read_skeleton(dart, path)
+    skeleton = _read_skeleton(path)
     root = skeleton.getRootBodyNode()
-    _set_friction(root, 0.0)  # a castor that is a part of it slides
+    _set_friction(root, 0.0)  # a castor that is part of the base slides
     hinges = [
-        _Hinge(dart, joint, root)
+        _Hinge(joint, root)
         for joint in skeleton.getJoints()
         if joint.getType() == "RevoluteJoint"
     ]
@@ -174,7 +161,7 @@ def _read_robot(dart: Any, path: Path, machine: Machine, physics: Physics) -> Da
     for wheel in wheels:
         _set_friction(wheel.joint.getChildBodyNode(), physics.friction)
     joints = []
-    levels = []  # of the wheels' axles, relative to the root
+    levels = []  # heights of the wheels' axles above the root
     for name in machine.joints:
         fitting = _find_fitting(name, pivots if name.startswith("steer") else wheels)
         if len(fitting) != 1:
@@ -198,22 +185,22 @@ def _set_friction(body: Any, friction: float) -> None:
 
 
 class _Hinge:
-    """A joint of a robot at rest, seen from its root."""
+    """A revolute joint, with its axis and place in the root's frame while the robot is at rest."""
 
-    def __init__(self, dart: Any, joint: Any, root: Any) -> None:
+    def __init__(self, joint: Any, root: Any) -> None:
         self.joint = joint
         transform = joint.getChildBodyNode().getTransform(root)
         self.axis = transform.rotation() @ joint.getAxis()
         self.place = transform.translation()
 
     def turn_positive(self) -> None:
-        """Lets positive speeds drive ahead, or turn to the left."""
+        """Makes positive speeds drive ahead, or turn to the left."""
         if self.axis.sum() < 0.0:
             self.joint.setAxis(-self.joint.getAxis())
 
 
 def _find_fitting(name: str, hinges: list[_Hinge]) -> list[_Hinge]:
-    """Returns the hinges on the side, and at the end, that the words of a name say."""
+    """Returns the hinges on the side and at the end that a name such as `rear_left` denotes."""
     x, y, _ = np.array([hinge.place for hinge in hinges]).reshape(-1, 3).T
     half_width = 0.5 * np.abs(y).max(initial=0.0)
     middle = 0.5 * (x.min(initial=np.inf) + x.max(initial=-np.inf))

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from rclpy.node import Node
 
-from nics_drl_bridge.extras.dart.scenery import load_dart
 from nics_drl_bridge.extras.dart.simulator import PHYSICS, DartSimulator
 from nics_drl_bridge.extras.physics.machines import design_machine
 from nics_drl_bridge.generator import SimulatorModel
@@ -19,8 +18,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 
 def check(robot: RobotSpec) -> None:
-    """Raises ConfigError without DART, or for a robot without a machine."""
-    load_dart()
+    """Raises ConfigError for a robot without a machine."""
     design_machine(robot, PHYSICS, "DART")
 
 

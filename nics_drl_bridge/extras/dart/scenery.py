@@ -3,11 +3,11 @@
 from collections.abc import Iterable
 from typing import Any
 
+import dartpy
 import numpy as np
 from numpy.typing import ArrayLike
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.extras.physics.machines import Physics
 from nics_drl_bridge.extras.physics.scenery import (
     BUMPER_FRICTION,
@@ -25,46 +25,36 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 ORIGIN = np.zeros(3)
 EDGE = 1e-5  # radius of the edges of a prism [m]
 RIM = 0.01  # thickness of the sides of a prism [m]
-# of the solver of contacts: its results are measured against the textbook
+# settings of the contact solver, chosen by comparison with the textbook
 TOLERANCE = 1e-3
 MOST_SWEEPS = 30
 
 
-def load_dart() -> Any:
-    """Returns the module `dartpy`. Raises ConfigError if it is not installed."""
-    try:
-        import dartpy
-    except ImportError:
-        fix = "run pip install 'nics_drl_bridge[dart]'."
-        raise ConfigError(f"DART is not installed; {fix}") from None
-    return dartpy
-
-
-def make_world(dart: Any, physics: Physics) -> Any:
+def make_world(physics: Physics) -> Any:
     """Returns a world with a floor, whose skeleton is the first."""
-    world = dart.simulation.World()
+    world = dartpy.simulation.World()
     world.setTimeStep(physics.timestep)
-    # Gazebo's choice; Bullet, which casts the rays, rounds what touches by 0.04 m.
-    world.setCollisionDetector(dart.collision.OdeCollisionDetector())
+    # As in Gazebo. Bullet, which casts the rays, would round colliding shapes by 0.04 m.
+    world.setCollisionDetector(dartpy.collision.OdeCollisionDetector())
     sleep = world.getDeactivationOptions()
     sleep.mEnabled = False
     world.setDeactivationOptions(sleep)
-    # By default, friction is limited along x and y apart, and robots skid too little in turns.
-    solver = dart.constraint.NsgsFrictionSolver()
+    # By default, friction is limited along x and y separately: robots skid too little in turns.
+    solver = dartpy.constraint.NsgsFrictionSolver()
     options = solver.getOptions()
     options.tolerance = TOLERANCE
     options.maxSweeps = MOST_SWEEPS
     solver.setOptions(options)
     world.getConstraintSolver().setBoxedLcpSolver(solver)
-    floor = add_fixed_body(dart, world, "floor")
-    plane = dart.dynamics.PlaneShape([0.0, 0.0, 1.0], 0.0)
+    floor = add_fixed_body(world, "floor")
+    plane = dartpy.dynamics.PlaneShape([0.0, 0.0, 1.0], 0.0)
     let_touch(add_shape(floor, plane), physics.friction)
     return world
 
 
-def add_fixed_body(dart: Any, world: Any, name: str) -> Any:
-    """Adds a body at the origin that nothing moves; returns it."""
-    skeleton = dart.dynamics.Skeleton(name)
+def add_fixed_body(world: Any, name: str) -> Any:
+    """Adds an immobile body at the origin; returns it."""
+    skeleton = dartpy.dynamics.Skeleton(name)
     _, body = skeleton.createFreeJointAndBodyNodePair()
     body.setName(name)
     skeleton.setMobile(False)
@@ -83,7 +73,7 @@ def place_body(body: Any, pose: Array, height: float = 0.0) -> None:
 
 
 def add_shape(body: Any, shape: Any, transform: Any = None) -> Any:
-    """Adds a shape to a body, which rays may see but nothing touches; returns its node."""
+    """Adds a shape that rays can hit but nothing touches to a body; returns its node."""
     node = body.createShapeNode(shape)
     if transform is not None:
         node.setRelativeTransform(transform)
@@ -97,9 +87,7 @@ def let_touch(node: Any, friction: float = BUMPER_FRICTION) -> None:
     node.getDynamicsAspect().setFrictionCoeff(friction)
 
 
-def _add_sides(
-    dart: Any, body: Any, corners: Array, level: float, height: float
-) -> None:
+def _add_sides(body: Any, corners: Array, level: float, height: float) -> None:
     """Adds a thin box along each side of a polygon with corners (V, 2)."""
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         along = end - start
@@ -107,13 +95,12 @@ def _add_sides(
         inward = np.array([-along[1], along[0]]) / length
         middle = 0.5 * (start + end + RIM * inward)
         heading = float(np.arctan2(along[1], along[0]))
-        side = dart.dynamics.BoxShape([length, RIM, height])
-        transform = make_transform(dart, [*middle, level], heading)
+        side = dartpy.dynamics.BoxShape([length, RIM, height])
+        transform = make_transform([*middle, level], heading)
         let_touch(add_shape(body, side, transform))
 
 
 def add_solid(
-    dart: Any,
     body: Any,
     solid: Solid,
     level: float,
@@ -122,33 +109,33 @@ def add_solid(
 ) -> Any:
     """Adds a solid at a pose (3,) in a body's frame; returns the node that rays see.
 
-    The solid reaches as far above as below the `level` [m]. Rays see a cylinder or a hull, in whose
-    place a capsule or boxes along the sides touch others, because ODE computes those exactly.
+    The solid is centred at the `level` [m]. For collisions, a capsule stands in for a cylinder and
+    boxes along the sides for a prism, because ODE computes their contacts exactly.
     """
-    shapes = dart.dynamics
+    shapes = dartpy.dynamics
     if isinstance(solid, Box):
         x, y, heading = geometry.compose(pose, [*solid.middle, solid.heading])
-        transform = make_transform(dart, [x, y, level], heading)
+        transform = make_transform([x, y, level], heading)
         node = add_shape(body, shapes.BoxShape([*solid.size, height]), transform)
         let_touch(node)
         return node
     if isinstance(solid, Cylinder):
-        transform = make_transform(dart, [*pose[:2], level])
+        transform = make_transform([*pose[:2], level])
         capsule = shapes.CapsuleShape(solid.radius, height)
         let_touch(add_shape(body, capsule, transform))
         return add_shape(body, shapes.CylinderShape(solid.radius, height), transform)
     corners = pose[:2] + geometry.rotate(solid.corners, pose[2])
-    _add_sides(dart, body, corners, level, height)
+    _add_sides(body, corners, level, height)
     middle = corners.mean(axis=0)
     ends = (-0.5 * height, 0.5 * height)
     spheres = [(EDGE, [x, y, end]) for x, y in corners - middle for end in ends]
     hull = shapes.MultiSphereConvexHullShape(spheres)
-    return add_shape(body, hull, make_transform(dart, [*middle, level]))
+    return add_shape(body, hull, make_transform([*middle, level]))
 
 
-def make_transform(dart: Any, place: ArrayLike, heading: float = 0.0) -> Any:
+def make_transform(place: ArrayLike, heading: float = 0.0) -> Any:
     """Returns a transform by a place (3,) [m] and a rotation about the vertical [rad]."""
-    transform = dart.math.Isometry3()
+    transform = dartpy.math.Isometry3()
     transform.set_translation(place)
     c = np.cos(heading)
     s = np.sin(heading)
@@ -165,21 +152,19 @@ def forbid_contact(world: Any, bodies: Iterable[Any], others: Iterable[Any]) -> 
             forbidden.addBodyNodePairToBlackList(body, other)
 
 
-def make_group(dart: Any, nodes: Iterable[Any]) -> Any:
+def make_group(nodes: Iterable[Any]) -> Any:
     """Returns the shapes of nodes as a group for `cast_scan`."""
-    group = dart.collision.BulletCollisionDetector().createCollisionGroup()
+    group = dartpy.collision.BulletCollisionDetector().createCollisionGroup()
     for node in nodes:
         group.addShapeFrame(node)
     return group
 
 
-def cast_scan(
-    dart: Any, group: Any, lidar: LidarSpec, pose: Array, height: float
-) -> Singles:
+def cast_scan(group: Any, lidar: LidarSpec, pose: Array, height: float) -> Singles:
     """Scans (B,) [m], REP-117, from a robot's pose (3,), at a height [m] among a group's shapes."""
     start, ends = aim_beams(lidar, pose, height)
-    option = dart.collision.RaycastOption()
-    result = dart.collision.RaycastResult()
+    option = dartpy.collision.RaycastOption()
+    result = dartpy.collision.RaycastResult()
     fractions = np.full(lidar.beams, np.inf)
     for i, end in enumerate(ends):
         result.clear()

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import dartpy
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -15,10 +16,7 @@ from nics_drl_bridge.extras.physics.machines import (
     Physics,
     design_machine,
 )
-from nics_drl_bridge.extras.physics.scenery import (
-    cut_shape,
-    cut_world,
-)
+from nics_drl_bridge.extras.physics.scenery import cut_shape
 from nics_drl_bridge.extras.physics.simulator import (
     PhysicsRobot,
     RayCastingSimulator,
@@ -28,7 +26,6 @@ from nics_drl_bridge.extras.physics.simulator import (
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.arrays import Singles
-from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -42,7 +39,6 @@ class DartRig(ServoRig):
 
     def __init__(
         self,
-        dart: Any,
         world: Any,
         spec: RobotSpec,
         machine: Machine,
@@ -53,13 +49,13 @@ class DartRig(ServoRig):
         self._world = world
         self._skeleton = body.skeleton
         self._height = body.height
-        self._frame = dart.dynamics.Frame.World()
+        self._frame = dartpy.dynamics.Frame.World()
         self.base = body.skeleton.getRootBodyNode()
         self._joints = [joint.getIndexInSkeleton(0) for joint in body.joints]
-        # enough to let one tyre slide that carries all
+        # enough to make a tyre slide that carries the whole robot
         torque = physics.friction * body.skeleton.getMass() * GRAVITY * machine.radius
         for name, joint in zip(machine.joints, body.joints, strict=True):
-            joint.setActuatorType(dart.dynamics.ActuatorType.SERVO)
+            joint.setActuatorType(dartpy.dynamics.ActuatorType.SERVO)
             limit = STEERING_TORQUE if name.startswith("steer") else torque
             joint.setForceLowerLimit(0, -limit)
             joint.setForceUpperLimit(0, limit)
@@ -129,7 +125,6 @@ class DartRobot(PhysicsRobot):
     def __init__(
         self, spec: RobotSpec, physics: Physics = PHYSICS, file: Path | None = None
     ) -> None:
-        self._dart = scenery.load_dart()
         self.spec = spec
         self._file = file
         self.machine = design_machine(spec, physics, self.engine)
@@ -139,11 +134,10 @@ class DartRobot(PhysicsRobot):
 
     def reset(self, pose: ArrayLike) -> Reading:
         """See `PhysicsRobot`."""
-        self._world = scenery.make_world(self._dart, self._physics)
-        body = make_body(self._dart, self.machine, self._physics, self._file)
+        self._world = scenery.make_world(self._physics)
+        body = make_body(self.machine, self._physics, self._file)
         self._world.addSkeleton(body.skeleton)
-        parts = self.spec, self.machine, body, self._physics
-        self.rig = DartRig(self._dart, self._world, *parts)
+        self.rig = DartRig(self._world, self.spec, self.machine, body, self._physics)
         self.rig.put(pose)
         return self.read()
 
@@ -157,6 +151,8 @@ class DartRobot(PhysicsRobot):
 class DartSimulator(RayCastingSimulator):
     """One world of robots in DART; for `file` see DartRobot."""
 
+    engine = "DART"
+
     def __init__(
         self,
         model: SimulatorModel,
@@ -166,59 +162,48 @@ class DartSimulator(RayCastingSimulator):
         randomisation: Randomisation | None = None,
         file: Path | None = None,
     ) -> None:
-        self._dart = scenery.load_dart()
         self._file = file
         super().__init__(model, world, robots, physics, randomisation=randomisation)
 
-    def design(self, spec: RobotSpec, physics: Physics) -> Machine:
-        """See `PhysicsSimulator`."""
-        return design_machine(spec, physics, "DART")
-
     def compile(self, bodies: Array) -> list[DartRig]:
         """See `PhysicsSimulator`."""
-        dart = self._dart
-        self._engine = scenery.make_world(dart, self._physics)
-        fixed = scenery.add_fixed_body(dart, self._engine, "scenery")
-        member = int(self.data.member[0])
+        self._engine = scenery.make_world(self._physics)
+        fixed = scenery.add_fixed_body(self._engine, "scenery")
         level = self._machine.radius
-        seen = [
-            scenery.add_solid(dart, fixed, solid, level)
-            for solid in cut_world(self.world.members[member])
-        ]
+        seen = [scenery.add_solid(fixed, wall, level) for wall in self.list_walls()]
         self._moving = {}
-        for k in np.flatnonzero(bodies[:, RADIUS] > 0.0).tolist():
-            pose = bodies[k, :3]
+        for obstacle in self.list_obstacles(bodies):
+            pose = obstacle.pose
             body = fixed
-            if self.sampler.motions[member][k] is not None:
-                body = scenery.add_fixed_body(dart, self._engine, f"obstacle_{k}")
+            if obstacle.moves:
+                name = f"obstacle_{obstacle.number}"
+                body = scenery.add_fixed_body(self._engine, name)
                 scenery.place_body(body, pose)
-                self._moving[k] = body
+                self._moving[obstacle.number] = body
                 pose = scenery.ORIGIN
-            for solid in cut_shape(self.sampler.shapes[int(bodies[k, SHAPE])]):
-                seen.append(scenery.add_solid(dart, body, solid, level, pose=pose))
+            for solid in cut_shape(obstacle.shape):
+                seen.append(scenery.add_solid(body, solid, level, pose=pose))
         return self._add_robots(seen, [fixed, *self._moving.values()])
 
     def _add_robots(self, seen: list[Any], obstacles: list[Any]) -> list[DartRig]:
-        """Adds the robots, of which only bumpers touch obstacles, and lets them see."""
-        dart = self._dart
+        """Adds the robots, whose bumpers alone touch obstacles, and what their lidars see."""
         spec = self.model.robot
         height = self._machine.radius
         rigs = []
         bumpers = []
         for m in range(self.data.pose.shape[1]):
-            body = make_body(dart, self._machine, self._physics, self._file)
+            body = make_body(self._machine, self._physics, self._file)
             body.skeleton.setName(f"robot_{m}")
             base = body.skeleton.getRootBodyNode()
             level = height - body.height
             bumpers.append(
                 [
-                    scenery.add_solid(dart, base, solid, level, height)
+                    scenery.add_solid(base, solid, level, height)
                     for solid in cut_shape(footprint_shape(spec))
                 ]
             )
             self._engine.addSkeleton(body.skeleton)
-            parts = self._machine, body, self._physics
-            rigs.append(DartRig(dart, self._engine, spec, *parts))
+            rigs.append(DartRig(self._engine, spec, self._machine, body, self._physics))
         bases = [rig.base for rig in rigs]
         for rig in rigs:
             wheels = rig.base.getSkeleton().getBodyNodes()[1:]
@@ -229,7 +214,7 @@ class DartSimulator(RayCastingSimulator):
         self._groups = []
         for bumper in bumpers:
             others = [one for one in bumpers if one is not bumper]
-            self._groups.append(scenery.make_group(dart, sum(others, seen)))
+            self._groups.append(scenery.make_group(sum(others, seen)))
         return rigs
 
     def place_obstacles(self, bodies: Array) -> None:
@@ -255,4 +240,4 @@ class DartSimulator(RayCastingSimulator):
         pose = self.data.pose[0, robot]
         group = self._groups[robot]
         height = self._machine.radius
-        return scenery.cast_scan(self._dart, group, self.model.lidar, pose, height)
+        return scenery.cast_scan(group, self.model.lidar, pose, height)

@@ -53,7 +53,7 @@ def scale(values: Array, scaled: Scaled) -> Array:
     return clamp(values, scaled.clip)
 
 
-def part_size(part: InputPart, scan_parts: int, outputs: Mapping[str, int]) -> int:
+def measure_part(part: InputPart, scan_parts: int, outputs: Mapping[str, int]) -> int:
     """Returns the number of elements of a part, given the sizes of the network's outputs."""
     size = 1
     if part.of == "scan":
@@ -214,7 +214,7 @@ class Adapter:
     def _check_inputs(self) -> None:
         for name, mapped in self._mapping.inputs.items():
             sizes = [
-                part_size(part, self._scan_parts, self._output_sizes)
+                measure_part(part, self._scan_parts, self._output_sizes)
                 for part in mapped.parts
             ]
             empty = self._empty_inputs[name]

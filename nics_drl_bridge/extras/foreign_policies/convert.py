@@ -12,7 +12,7 @@ from nics_drl_bridge.config import parse_yaml, read_text, validate
 from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.extras.foreign_policies import leapp_import
-from nics_drl_bridge.extras.foreign_policies.adapter import Adapter, part_size
+from nics_drl_bridge.extras.foreign_policies.adapter import Adapter, measure_part
 from nics_drl_bridge.extras.foreign_policies.mapping import ForeignPolicy
 from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel, open_model
@@ -61,7 +61,7 @@ def import_policy(source: str | Path, model: SimulatorModel | None = None) -> by
     `model` is the robot; None: the one that the mapping names. Raises ConfigError, or PolicyError,
     which says what can't be expressed.
     """
-    path = leapp_import.description_of(Path(source))
+    path = leapp_import.find_description(Path(source))
     if path is None:
         return _convert(_read_mapping(Path(source)), model)
     bundle = leapp_import.read_bundle(path)
@@ -72,7 +72,7 @@ def import_policy(source: str | Path, model: SimulatorModel | None = None) -> by
         raise ConfigError(
             f"{path}: a foreign bundle names no robot; name one with --robot."
         )
-    data = leapp_import.mapping_of(bundle, model)
+    data = leapp_import.derive_mapping(bundle, model)
     return _convert(_join(validate(data, ForeignPolicy, str(path)), bundle), model)
 
 
@@ -91,7 +91,7 @@ def _read_mapping(path: Path) -> ForeignNetwork:
     mapping = validate(data, ForeignPolicy, str(path))
     file = path.parent / mapping.network
     if file.is_dir() or file.suffix in MAPPINGS:
-        description = leapp_import.description_of(file)
+        description = leapp_import.find_description(file)
         if description is not None:
             return _join(mapping, leapp_import.read_bundle(description))
     if file.suffix != SUFFIX:
@@ -178,7 +178,7 @@ def _fix_shapes(model: Any, mapping: ForeignPolicy, scan_parts: int) -> Any:
         size = 1
         if value.name in mapping.inputs:
             parts = mapping.inputs[value.name].parts
-            size = sum(part_size(part, scan_parts, outputs) for part in parts)
+            size = sum(measure_part(part, scan_parts, outputs) for part in parts)
         known = math.prod(d.dim_value for d in dimensions if d.dim_value)
         for dimension in dimensions:
             if not dimension.dim_value:

@@ -15,7 +15,6 @@ import numpy as np
 import onnx
 import safetensors.numpy
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
-from onnx import TensorProto
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import PolicyError
@@ -34,7 +33,6 @@ CONFIG_VERSION = "1.3"  # version of the format
 SIGN = "system information:"  # in the YAML file of every bundle
 OURS = "leapp/"  # prefix of the nodes and weights that an export adds
 TAKEN = "nics_drl_bridge_observation"  # metadata key: the input that an export replaces
-AXES = ["x", "y", "z"]
 SECTORS = "state/lidar/sectors"
 BEAMS = "state/lidar/beams"
 Data = dict[str, Any]
@@ -58,10 +56,10 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
     place = Path(folder)
     marker = f"{place.resolve().name}.yaml"
     model = onnx.load_model_from_string(content)
-    pieces = _pieces(policy)
-    _split(model, pieces)
+    pieces = _list_pieces(policy)
+    _split_observation(model, pieces)
     made = model.SerializeToString(deterministic=True)
-    if restored(model) != content:
+    if restore_policy(model) != content:
         reason = "was not written by `export_policy`, so it could not be restored."
         raise PolicyError(str(policy.path), "file", reason)
     network = f"{NODE}.onnx"
@@ -75,85 +73,101 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
             arrays = {f"{NODE}/{onnx_graph.STATE_IN}": start}
             write_bytes(temporary / start_values, safetensors.numpy.save(arrays))
         write_text(
-            temporary / marker, dump_yaml(_described(policy, pieces, made, place))
+            temporary / marker, dump_yaml(_describe_bundle(policy, pieces, made, place))
         )
     return place / marker
 
 
-def _pieces(policy: PolicyFile) -> list[Piece]:
+def _list_pieces(policy: PolicyFile) -> list[Piece]:
     """Returns the inputs of a bundle, in the order of the observation."""
     contract = policy.contract
-    parts = contract.observation.scan_parts
-    rest = len(contract.observation.rest_low)
-    layout = contract.scan
-    lidar = contract.lidar
-    seen: Data = {"kind": BEAMS, "lidar": lidar.model_dump(mode="json")}
-    if layout is not None:
-        seen = {"kind": SECTORS, "scan": layout.model_dump(mode="json")}
+    seen: Data = {"kind": BEAMS, "lidar": contract.lidar.model_dump(mode="json")}
+    if contract.scan is not None:
+        seen = {"kind": SECTORS, "scan": contract.scan.model_dump(mode="json")}
     seen["unit"] = "fraction of range_max; 1 free, 0 too close or unknown"
-    pieces = [Piece("scan", parts, tuple(range(parts)), seen)]
-    facts: Data
+    scan = _make_whole_piece("scan", contract.observation.scan_parts, seen)
+    low = contract.observation.rest_low
+    high = contract.observation.rest_high
     if contract.task.name != "navigation":
-        low = contract.observation.rest_low
-        high = contract.observation.rest_high
         limits = [list(pair) for pair in zip(low, high, strict=True)]
         facts = {"kind": f"state/task/{contract.task.name}", "limits": limits}
-        return [*pieces, Piece("rest", rest, tuple(range(rest)), facts)]
-    goal = ["goal.distance", "goal.cosine", "goal.sine"]
-    for name, kind, kept, elements, unit in (
-        ("goal", "command/goal/polar", (0, 1, 2), goal, "m"),
-        ("linear_velocity", "state/body/linear_velocity", (0, 1), AXES, "m/s"),
-        ("angular_velocity", "state/body/angular_velocity", (2,), AXES, "rad/s"),
-    ):
-        facts = {"kind": kind, "element_names": [elements], "unit": unit}
-        pieces.append(Piece(name, 3, kept, facts))
-    for sensor in contract.sensors:
-        facts = {
-            "kind": f"state/{sensor.kind}",
-            "sensor": sensor.model_dump(mode="json"),
-        }
-        pieces.append(
-            Piece(sensor.name, sensor.parts, tuple(range(sensor.parts)), facts)
+        return [scan, _make_whole_piece("rest", len(low), facts)]
+    sensors = [
+        _make_whole_piece(
+            sensor.name,
+            sensor.parts,
+            {"kind": f"state/{sensor.kind}", "sensor": sensor.model_dump(mode="json")},
         )
-    return pieces
+        for sensor in contract.sensors
+    ]
+    return [scan, *GOAL_AND_TWIST, *sensors]
 
 
-def _split(model: Any, pieces: Iterable[Piece]) -> None:
+def _make_whole_piece(name: str, width: int, facts: Data) -> Piece:
+    """Returns an input whose elements are all in the observation."""
+    return Piece(name, width, tuple(range(width)), facts)
+
+
+def _make_piece(
+    name: str, kind: str, kept: tuple[int, ...], elements: list[str], unit: str
+) -> Piece:
+    """Returns an input of three elements, of which the observation has those that are kept."""
+    facts = {"kind": kind, "element_names": [elements], "unit": unit}
+    return Piece(name, 3, kept, facts)
+
+
+AXES = ["x", "y", "z"]
+GOAL_AND_TWIST = (
+    _make_piece(
+        "goal",
+        "command/goal/polar",
+        (0, 1, 2),
+        ["goal.distance", "goal.cosine", "goal.sine"],
+        "m",
+    ),
+    _make_piece("linear_velocity", "state/body/linear_velocity", (0, 1), AXES, "m/s"),
+    _make_piece("angular_velocity", "state/body/angular_velocity", (2,), AXES, "rad/s"),
+)
+
+
+def _split_observation(model: Any, pieces: Iterable[Piece]) -> None:
     """Replaces the observation input of a graph by separate inputs and a concatenation."""
-    batch = model.graph.input[0].type.tensor_type.shape.dim[0]
-    entry = model.metadata_props.add()
-    entry.key = TAKEN
-    entry.value = base64.b64encode(model.graph.input[0].SerializeToString()).decode()
+    graph = model.graph
+    observation, *others = graph.input
+    taken = base64.b64encode(observation.SerializeToString()).decode()
+    model.metadata_props.add(key=TAKEN, value=taken)
+    inputs = []
     rows = []
-    infos = []
     nodes = []
     weights = []
-    others = list(model.graph.input)[1:]
     for piece in pieces:
-        infos.append(
-            onnx.helper.make_tensor_value_info(piece.name, TensorProto.FLOAT, [1, 1])
-        )
-        infos[-1].type.tensor_type.shape.dim[0].CopyFrom(batch)
-        infos[-1].type.tensor_type.shape.dim[1].dim_value = piece.width
-        rows.append(piece.name)
+        entry = onnx.ValueInfoProto()
+        entry.CopyFrom(observation)
+        entry.name = piece.name
+        entry.type.tensor_type.shape.dim[1].dim_value = piece.width
+        inputs.append(entry)
+        row = piece.name
         if len(piece.kept) < piece.width:
-            rows[-1] = f"{OURS}{piece.name}"
-            places = f"{rows[-1]}_places"
+            row = f"{OURS}{piece.name}"
+            places = f"{row}_places"
             kept = np.array(piece.kept, np.int64)
             weights.append(onnx.numpy_helper.from_array(kept, places))
-            ends = ([piece.name, places], [rows[-1]])
+            ends = [piece.name, places], [row]
             nodes.append(onnx.helper.make_node("Gather", *ends, axis=1))
+        rows.append(row)
     nodes.append(onnx.helper.make_node("Concat", rows, [onnx_graph.INPUT], axis=1))
-    for held, values in (
-        (model.graph.input, [*infos, *others]),
-        (model.graph.node, [*nodes, *model.graph.node]),
-        (model.graph.initializer, [*weights, *model.graph.initializer]),
-    ):
-        del held[:]
-        held.extend(values)
+    _replace_all(graph.input, [*inputs, *others])
+    _replace_all(graph.node, [*nodes, *graph.node])
+    _replace_all(graph.initializer, [*weights, *graph.initializer])
 
 
-def restored(model: Any) -> bytes | None:
+def _replace_all(entries: Any, new: list[Any]) -> None:
+    """Replaces the entries of a repeated field."""
+    del entries[:]
+    entries.extend(new)
+
+
+def restore_policy(model: Any) -> bytes | None:
     """Restores the exact policy file from an exported ModelProto; None if we did not export it.
 
     The seal in the file itself shows whether it is intact.
@@ -161,36 +175,35 @@ def restored(model: Any) -> bytes | None:
     entries = [entry for entry in model.metadata_props if entry.key == TAKEN]
     if len(entries) != 1:
         return None
-    taken = onnx.ValueInfoProto()
-    ours = onnx.ModelProto()
+    observation = onnx.ValueInfoProto()
     try:
-        taken.ParseFromString(base64.b64decode(entries[0].value))
+        observation.ParseFromString(base64.b64decode(entries[0].value))
     except (ValueError, DecodeError):
         return None
+    ours = onnx.ModelProto()
     ours.CopyFrom(model)
     ours.metadata_props.remove(entries[0])
-    first = next(
-        (k for k, n in enumerate(ours.graph.node) if onnx_graph.INPUT in n.output), -1
-    )
-    del ours.graph.node[: first + 1]
-    weights = [w for w in ours.graph.initializer if not w.name.startswith(OURS)]
-    states = [v for v in model.graph.input if v.name == onnx_graph.STATE_IN]
-    for held, values in (
-        (ours.graph.initializer, weights),
-        (ours.graph.input, [taken, *states]),
-    ):
-        del held[:]
-        held.extend(values)
+    graph = ours.graph
+    joins = [k for k, node in enumerate(graph.node) if onnx_graph.INPUT in node.output]
+    if joins:
+        del graph.node[: joins[0] + 1]
+    weights = [each for each in graph.initializer if not each.name.startswith(OURS)]
+    states = [each for each in graph.input if each.name == onnx_graph.STATE_IN]
+    _replace_all(graph.initializer, weights)
+    _replace_all(graph.input, [observation, *states])
     return bytes(ours.SerializeToString(deterministic=True))
 
 
-def _described(
+def _describe_bundle(
     policy: PolicyFile, pieces: Iterable[Piece], made: bytes, place: Path
 ) -> Data:
     contract = policy.contract
     name = place.resolve().name
-    inputs = [_tensor(piece.name, [1, piece.width], **piece.facts) for piece in pieces]
-    outputs = _outputs(contract)
+    inputs = [
+        _describe_tensor(piece.name, [1, piece.width], **piece.facts)
+        for piece in pieces
+    ]
+    outputs = _describe_outputs(contract)
     pipeline: Data = {
         "configs": {
             "frequency": 1.0 / contract.control_period,
@@ -210,8 +223,8 @@ def _described(
         pipeline["feedback_flow"] = {source: [target]}
         pipeline["initial_values"] = f"{name}_initial_values.safetensors"
         pipeline["configs"]["longest_gap"] = state.longest_gap
-        inputs.append(_tensor(onnx_graph.STATE_IN, [1, state.size]))
-        outputs.append(_tensor(onnx_graph.STATE_OUT, [1, state.size]))
+        inputs.append(_describe_tensor(onnx_graph.STATE_IN, [1, state.size]))
+        outputs.append(_describe_tensor(onnx_graph.STATE_OUT, [1, state.size]))
     md5 = hashlib.md5(made, usedforsecurity=False).hexdigest()
     parameters = {
         "model_path": f"{NODE}.onnx",
@@ -224,7 +237,7 @@ def _described(
     return {"models": {NODE: node}, "pipeline": pipeline, "system information": system}
 
 
-def _outputs(contract: Contract) -> list[Data]:
+def _describe_outputs(contract: Contract) -> list[Data]:
     """Describes the action, and the resulting command in the robot's units."""
     commands = contract.robot.command
     limits = [[command.min, command.max] for command in commands]
@@ -233,14 +246,14 @@ def _outputs(contract: Contract) -> list[Data]:
     of_twist = all(command.is_twist for command in commands)
     names = [str(command.cmd_vel) if of_twist else command.name for command in commands]
     return [
-        _tensor(
+        _describe_tensor(
             onnx_graph.ACTION,
             [1] if discrete else [1, size],
             dtype="int64" if discrete else "float32",
             kind="target/action",
             **({} if discrete else {"limits": [[-1.0, 1.0] for _ in commands]}),
         ),
-        _tensor(
+        _describe_tensor(
             onnx_graph.COMMAND,
             [1, size],
             kind="target/body/velocity" if of_twist else "target/command",
@@ -251,5 +264,7 @@ def _outputs(contract: Contract) -> list[Data]:
     ]
 
 
-def _tensor(name: str, shape: list[int], dtype: str = "float32", **facts: Any) -> Data:
+def _describe_tensor(
+    name: str, shape: list[int], dtype: str = "float32", **facts: Any
+) -> Data:
     return {"name": name, "dtype": dtype, "shape": shape, "type": "tensor", **facts}

@@ -17,7 +17,7 @@ from nics_drl_bridge.extras.foreign_policies.leapp_export import (
     BEAMS,
     SECTORS,
     Data,
-    restored,
+    restore_policy,
 )
 from nics_drl_bridge.extras.foreign_policies.mapping import ForeignState
 from nics_drl_bridge.files import hash_bytes
@@ -119,7 +119,7 @@ class Bundle(NamedTuple):
     ours: bytes | None  # the policy file exported as this bundle; None if it is foreign
 
 
-def description_of(place: Path) -> Path | None:
+def find_description(place: Path) -> Path | None:
     """Returns the YAML file of a bundle, given that file or its folder; None for other YAML files.
 
     Raises PolicyError unless a folder has exactly one, ConfigError if the file can't be read.
@@ -137,8 +137,8 @@ def description_of(place: Path) -> Path | None:
     return descriptions[0] if descriptions else None
 
 
-def _read_network(path: Path, parameters: Parameters, place: str) -> bytes:
-    """Reads the network of a node of a bundle. Raises PolicyError."""
+def _read_network(path: Path, parameters: Parameters, place: str) -> Any:
+    """Reads and checks the network of a node, an onnx.ModelProto. Raises PolicyError."""
     if parameters.backend != "onnx":
         reason = (
             f"is {parameters.backend!r}, which is not supported; export it with 'onnx'."
@@ -150,7 +150,9 @@ def _read_network(path: Path, parameters: Parameters, place: str) -> bytes:
             f"does not match {parameters.model_path!r}, which was changed or damaged."
         )
         raise PolicyError(str(path), f"{place}.sha256sum", reason)
-    return data
+    file = str(path.parent / parameters.model_path)
+    rehearsal.rehearse(data, file, runs=False)
+    return onnx_graph.parse(data, file)
 
 
 def read_bundle(path: Path) -> Bundle:
@@ -158,15 +160,11 @@ def read_bundle(path: Path) -> Bundle:
     source = str(path)
     description = validate(parse_yaml(read_text(path), source), Description, source)
     pipeline = description.pipeline
-    models = {}
-    digests = []
-    for name, node in description.models.items():
-        parameters = node.parameters
-        data = _read_network(path, parameters, f"models.{name}.parameters")
-        digests.append(parameters.sha256sum)
-        file = str(path.parent / parameters.model_path)
-        rehearsal.rehearse(data, file, runs=False)
-        models[name] = onnx_graph.parse(data, file)
+    models = {
+        name: _read_network(path, node.parameters, f"models.{name}.parameters")
+        for name, node in description.models.items()
+    }
+    digests = [node.parameters.sha256sum for node in description.models.values()]
     names = _name_ends(pipeline)
     starts = {}
     if pipeline.initial_values is not None:
@@ -184,7 +182,7 @@ def read_bundle(path: Path) -> Bundle:
         states,
         _join(models, pipeline.data_flow, names, source),
         hash_bytes("".join(digests).encode()),
-        restored(next(iter(models.values()))) if len(models) == 1 else None,
+        restore_policy(next(iter(models.values()))) if len(models) == 1 else None,
     )
 
 
@@ -285,7 +283,7 @@ def _rename_ends(graph: Any, names: Mapping[str, str]) -> None:
 # The mapping of a foreign bundle, as far as the bundle states it.
 
 
-def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
+def derive_mapping(bundle: Bundle, model: SimulatorModel) -> Data:
     """Derives the `ForeignPolicy` mapping of a bundle from the kinds and names of its elements.
 
     Raises PolicyError for an input whose meaning is not stated.
@@ -304,7 +302,7 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
     for name, entry in bundle.inputs.items():
         if name in bundle.states:
             continue
-        data["inputs"][name] = {"parts": _parts(bundle, name, entry, data)}
+        data["inputs"][name] = {"parts": _derive_parts(bundle, name, entry, data)}
     for name, entry in bundle.outputs.items():
         _add_commands(data["outputs"], name, entry, model)
     outputs = data["outputs"].keys()
@@ -318,15 +316,17 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
     return data
 
 
-def _parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
+def _derive_parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
     kind = entry.kind or ""
     extra = entry.model_extra or {}
     if kind == BEAMS or (kind == SECTORS and isinstance(extra.get("scan"), dict)):
         layout = extra.get("scan")
         data["scan"] = layout
-        share = str(extra.get("unit", "")).startswith("share")
         far = (extra.get("lidar") if layout is None else layout) or {}
-        return [{"of": "scan", "divide": far.get("range_max", 1.0) if share else 1.0}]
+        # "share" in bundles of earlier versions
+        is_fraction = str(extra.get("unit", "")).startswith(("fraction", "share"))
+        divisor = far.get("range_max", 1.0) if is_fraction else 1.0
+        return [{"of": "scan", "divide": divisor}]
     size = math.prod(entry.shape) if isinstance(entry.shape, list) else 0
     meanings = SEEN.get(kind, {})
     names = entry.names

@@ -1,1 +1,5 @@
 """Detailed robots in MuJoCo: wheels with contact, friction and motors."""
+
+from nics_drl_bridge.extensions import require
+
+require("MuJoCo", "mujoco")

@@ -1,48 +1,29 @@
 """Robots as MJCF for MuJoCo; tyres are ellipsoids, which neither jump nor scrub."""
 
-from typing import Any
-
 import numpy as np
 from numpy.polynomial import polynomial
 
-from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.extras.physics.machines import (
     ROLLER_MASS,
     STEERING_TORQUE,
     Machine,
     Physics,
     Wheel,
-    design_machine,
     place_rollers,
 )
-from nics_drl_bridge.robot.spec import RobotSpec
 
 # torque limit of a motor, relative to the torque of the maximum acceleration
 TORQUE_RESERVE = 1.5
-ROTOR = 0.25  # inertia of a geared motor, relative to its share of the robot's inertia
+# inertia of a geared motor, relative to the robot's inertia per driven wheel
+ROTOR = 0.25
 SERVO_LAG_S = 0.005  # lag of a motor behind its set point
-# the same for a motor that keeps its speed although its tyres are dragged sideways
+# the same for a motor that must keep its speed while its tyres are dragged sideways
 STIFF_SERVO_LAG_S = 0.001
 # MuJoCo's `impratio`: stiffness of tyres against skidding relative to that against compression.
 # At 1, MuJoCo's convex contacts lift sliding wheels so far that they hop off the floor.
 SKIDDING = 0.01
 STEERING_STIFFNESS = 1.0  # torque of a steering servo per error [N m/rad]
 MISFIT = 0.01  # maximum error of a wheel's angle due to the tie rod [rad]
-
-
-def load_mujoco() -> Any:
-    """Returns the module `mujoco`. Raises ConfigError if it is not installed."""
-    try:
-        import mujoco
-    except ImportError:
-        fix = "run pip install 'nics_drl_bridge[mujoco]'."
-        raise ConfigError(f"MuJoCo is not installed; {fix}") from None
-    return mujoco
-
-
-def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
-    """Designs a robot's machine. Raises ConfigError for an unknown kind or a missing parameter."""
-    return design_machine(spec, physics or Physics(), "MuJoCo")
 
 
 def write_mjcf(machine: Machine, physics: Physics) -> str:

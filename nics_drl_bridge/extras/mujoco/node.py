@@ -6,9 +6,8 @@ from functools import partial
 from rclpy.node import Node
 
 from nics_drl_bridge import defaults
-from nics_drl_bridge.extras.mujoco.machines import build_machine, load_mujoco
-from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
-from nics_drl_bridge.extras.physics.machines import Physics
+from nics_drl_bridge.extras.mujoco.simulator import PHYSICS, MujocoSimulator
+from nics_drl_bridge.extras.physics.machines import design_machine
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.nodes.device_parameters import get_randomisation
 from nics_drl_bridge.nodes.parameters import FRICTION
@@ -19,9 +18,8 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 
 def check(robot: RobotSpec) -> None:
-    """Raises ConfigError without MuJoCo, or for a robot without a machine."""
-    load_mujoco()
-    build_machine(robot)
+    """Raises ConfigError for a robot without a machine."""
+    design_machine(robot, PHYSICS, "MuJoCo")
 
 
 def mujoco_simulator(
@@ -29,7 +27,7 @@ def mujoco_simulator(
 ) -> MujocoSimulator:
     """Makes robots in MuJoCo, with the lidar and floor of the node's parameters."""
     renderer = declare_renderer(node, defaults.MUJOCO_RENDERER)
-    physics = replace(Physics(), friction=declare_row(node, FRICTION))
+    physics = replace(PHYSICS, friction=declare_row(node, FRICTION))
     return MujocoSimulator(
         model, world, robots, renderer, physics, get_randomisation(node)
     )

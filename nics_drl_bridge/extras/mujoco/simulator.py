@@ -1,19 +1,17 @@
 """Robots in MuJoCo: one on an infinite floor, or several in a world, like FastSimulator."""
 
+from functools import cached_property
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
 from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.extras.mujoco import scenery
-from nics_drl_bridge.extras.mujoco.machines import (
-    build_machine,
-    load_mujoco,
-    write_mjcf,
-)
-from nics_drl_bridge.extras.physics.machines import Machine, Physics
+from nics_drl_bridge.extras.mujoco.machines import write_mjcf
+from nics_drl_bridge.extras.physics.machines import Machine, Physics, design_machine
 from nics_drl_bridge.extras.physics.simulator import (
     PhysicsRobot,
     PhysicsSimulator,
@@ -22,12 +20,12 @@ from nics_drl_bridge.extras.physics.simulator import (
 )
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.interface import Array
-from nics_drl_bridge.lidar.exact_kernels import RADIUS
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
+PHYSICS = Physics()
 SETTLING_S = 0.5
 
 
@@ -121,38 +119,39 @@ class MujocoRig(Rig):
 
 
 class MujocoRobot(PhysicsRobot):
-    """A robot on an infinite floor in MuJoCo; see `build_machine`."""
+    """A robot on an infinite floor in MuJoCo."""
 
     engine = "MuJoCo"
 
-    def __init__(self, spec: RobotSpec, physics: Physics | None = None) -> None:
-        self._mujoco = load_mujoco()
+    def __init__(self, spec: RobotSpec, physics: Physics = PHYSICS) -> None:
         self.spec = spec
-        self.machine = build_machine(spec, physics)
-        xml = write_mjcf(self.machine, physics or Physics())
-        self._model = self._mujoco.MjModel.from_xml_string(xml)
-        self._data = self._mujoco.MjData(self._model)
+        self.machine = design_machine(spec, physics, self.engine)
+        xml = write_mjcf(self.machine, physics)
+        self._model = mujoco.MjModel.from_xml_string(xml)
+        self._data = mujoco.MjData(self._model)
         self.timestep = float(self._model.opt.timestep)
         self.advance(round(SETTLING_S / self.timestep))
         # (nq,) MuJoCo positions at rest at the origin
-        self.rest = self._data.qpos.copy()
+        self.rest: Array = self._data.qpos.copy()
         self.rig = MujocoRig(spec, self.machine, self._model, self._data, self.rest)
         self.reset(np.zeros(3))
 
     def reset(self, pose: ArrayLike) -> Reading:
         """See `PhysicsRobot`."""
-        self._mujoco.mj_resetData(self._model, self._data)
+        mujoco.mj_resetData(self._model, self._data)
         self.rig.put(pose)
-        self._mujoco.mj_forward(self._model, self._data)
+        mujoco.mj_forward(self._model, self._data)
         return self.read()
 
     def advance(self, steps: int) -> None:
         """See `PhysicsRobot`."""
-        self._mujoco.mj_step(self._model, self._data, nstep=steps)
+        mujoco.mj_step(self._model, self._data, nstep=steps)
 
 
 class MujocoSimulator(PhysicsSimulator):
     """One world of robots in MuJoCo."""
+
+    engine = "MuJoCo"
 
     def __init__(
         self,
@@ -160,59 +159,52 @@ class MujocoSimulator(PhysicsSimulator):
         world: AnyWorld,
         robots: int = 1,
         renderer: Renderer = defaults.MUJOCO_RENDERER,
-        physics: Physics | None = None,
+        physics: Physics = PHYSICS,
         randomisation: Randomisation | None = None,
     ) -> None:
-        self._mujoco = load_mujoco()
-        physics = physics or Physics()
         super().__init__(model, world, robots, physics, renderer, randomisation)
 
-    def design(self, spec: RobotSpec, physics: Physics) -> Machine:
-        """See `PhysicsSimulator`."""
-        alone = MujocoRobot(spec, physics)
-        self._rest = alone.rest
-        return alone.machine
+    @cached_property
+    def _rest(self) -> Array:
+        """Positions (nq,) of one robot at rest at the origin."""
+        return MujocoRobot(self.model.robot, self._physics).rest
 
     def compile(self, bodies: Array) -> list[Any]:
         """See `PhysicsSimulator`."""
         spec = self.model.robot
         robots = self.data.pose.shape[1]
-        member = int(self.data.member[0])
+        obstacles = list(self.list_obstacles(bodies))
         compiled = self._simulation = scenery.compile_scene(
-            self._mujoco,
             self._machine,
             self._physics,
             footprint_shape(spec),
             robots,
-            self.world.members[member],
-            self.sampler.motions[member],
-            self.sampler.shapes,
-            bodies,
+            self.list_walls(),
+            obstacles,
         )
-        self._data = self._mujoco.MjData(compiled)
-        there = np.flatnonzero(bodies[:, RADIUS] > 0.0).tolist()
-        ids = [
-            int(compiled.body(f"{scenery.OBSTACLE_NAME}{k}").mocapid[0]) for k in there
-        ]
-        self._mocap = [(k, one) for k, one in zip(there, ids, strict=True) if one >= 0]
+        self._data = mujoco.MjData(compiled)
+        self._mocap = {
+            k: int(compiled.body(f"{scenery.OBSTACLE_NAME}{k}").mocapid[0])
+            for k in (each.number for each in obstacles if each.moves)
+        }
         self._bumper_of = scenery.find_bumpers(compiled, robots)
         parts = self._machine, compiled, self._data, self._rest
         return [MujocoRig(spec, *parts, m) for m in range(robots)]
 
     def refresh(self) -> None:
         """See `PhysicsSimulator`."""
-        self._mujoco.mj_forward(self._simulation, self._data)
+        mujoco.mj_forward(self._simulation, self._data)
 
     def place_obstacles(self, bodies: Array) -> None:
         """See `PhysicsSimulator`."""
-        for k, mocap in self._mocap:
+        for k, mocap in self._mocap.items():
             self._data.mocap_pos[mocap, :2] = bodies[k, :2]
             self._data.mocap_quat[mocap] = scenery.make_quaternion(bodies[k, 2])
 
     def advance(self, steps: int) -> list[int]:
         """See `PhysicsSimulator`."""
         data = self._data
-        self._mujoco.mj_step(self._simulation, data, nstep=steps)
+        mujoco.mj_step(self._simulation, data, nstep=steps)
         if any(warning.number for warning in data.warning):
             what = f"the motion of robot {self.model.robot.name!r} diverges"
             fix = "shorten the timestep of its Physics."

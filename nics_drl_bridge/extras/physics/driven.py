@@ -57,11 +57,11 @@ class DrivenSimulator(FastSimulator):
         counted: Array,
         touched: Mask,
     ) -> None:
-        """Takes over the robots' motion in the period, and make their measurements.
+        """Takes over the robots' motion in the period, and makes their measurements.
 
-        The arguments hold, at the end of the period, the true poses, body twists and
-        states (M, ...); pose and body twist (M, 3) by wheel odometry without noise; and
-        (M,) true for robots that touched anything.
+        The arguments are, at the end of the period: the true poses, body twists and states
+        (M, ...); pose and body twist (M, 3) by wheel odometry without noise; and (M,) True for
+        robots that touched anything.
         """
         data = self.data
         data.pose[0] = pose

@@ -18,14 +18,16 @@ STEERING_TORQUE = 1.0
 # maximum radius of a roller, relative to the radius of the wheel
 MAX_ROLLER_RADIUS = 0.25
 ROLLER_MASS = 0.005
-SPHERES = 5  # that form a roller; nine take twice the time, and move it the same
+SPHERES = 5  # per roller; nine take twice the time for the same motion
 # fraction of a roller's length beyond which its spheres would end in a point
 ROLLER_END = 0.95
-ROTOR_INERTIA = 2e-7  # added to a roller's, which is too small to compute with [kg m^2]
+# added to a roller's inertia, which alone is too small to simulate [kg m^2]
+ROTOR_INERTIA = 2e-7
 CASTOR_MASS = 0.03  # [kg]
-PIVOT_MASS = 0.02  # of what steers a wheel [kg]
+PIVOT_MASS = 0.02  # of the part that steers a wheel [kg]
 PIVOT_INERTIA = 1e-4  # [kg m^2]
-ROLLED = 1.0, 0.9884, 1.0  # measured on rollers under load, in sideways drives
+# actual twist of a mecanum robot relative to its wheels' twist, measured in sideways drives
+ROLLED = 1.0, 0.9884, 1.0
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class Physics:
     softness: float = 0.005
     bearing: float = 1e-6  # viscous friction of free wheels and rollers [N m s/rad]
     rollers: int = 12  # per mecanum wheel
-    # of robots that take the turn rate from a gyro, read every 0.01 s
+    # of the gyro, read every 0.01 s, of robots that take the turn rate from it
     gyro_bias: float = 0.0  # [rad/s]
     gyro_noise: float = 0.0  # standard deviation of a reading [rad/s]
 
@@ -51,8 +53,8 @@ class Physics:
 class Wheel:
     """A wheel, which rolls about y."""
 
-    name: str  # of its joint
-    place: tuple[float, float]  # x, y of its middle in `base_link` [m]
+    name: str  # name of its joint
+    place: tuple[float, float]  # x, y of its centre in `base_link` [m]
     driven: bool = True
     steering: str = ""  # name of the joint about z that steers it; empty: none
     # of a mecanum wheel: 1 if the axle of the roller on the floor points forward and left, else -1
@@ -65,10 +67,12 @@ class Machine:
 
     kind: str
     radius: float  # of the wheels [m]
-    centre: tuple[float, float, float]  # of the chassis' mass in `base_link` [m]
-    size: tuple[float, float, float]  # of the chassis [m]
+    centre: tuple[
+        float, float, float
+    ]  # centre of mass of the chassis in `base_link` [m]
+    size: tuple[float, float, float]  # size of the chassis [m]
     wheels: tuple[Wheel, ...]
-    lags: tuple[float, ...]  # (S,) of the motors behind each wanted state [s]
+    lags: tuple[float, ...]  # (S,) lags of the motors behind each wanted state [s]
     joints: tuple[str, ...]  # names of the J joints with encoders
     # maps a wanted state (S,) to the actuators' inputs (U,)
     controls: Callable[[Array], Array]
@@ -80,6 +84,26 @@ class Machine:
     # actual twist relative to the wheels' twist
     calibrated: tuple[float, float, float] = (1.0, 1.0, 1.0)
     gyro: bool = False  # True: odometry gets the turn rate from a gyro, not from wheels
+
+
+def weigh_chassis(machine: Machine, physics: Physics) -> Array:
+    """Returns the moments of inertia (3,) of a chassis about its centre [kg m^2]."""
+    squares = np.square(machine.size)
+    return np.asarray(physics.mass * (squares.sum() - squares) / 12.0)
+
+
+def weigh_wheel(
+    wheel: Wheel, machine: Machine, physics: Physics
+) -> tuple[float, Array]:
+    """Returns the mass [kg] and moments of inertia (3,) [kg m^2] of a wheel without rollers."""
+    mass = physics.wheel_mass
+    radius = machine.radius
+    width = 0.4 * radius
+    if wheel.lean:
+        mass -= physics.rollers * ROLLER_MASS
+        radius *= 0.7
+    across = mass * (3.0 * radius**2 + width**2) / 12.0
+    return mass, np.array([across, 0.5 * mass * radius**2, across])
 
 
 def design_machine(spec: RobotSpec, physics: Physics, engine: str) -> Machine:
@@ -236,7 +260,7 @@ class Roller:
 
     @property
     def spheres(self) -> tuple[Array, Array]:
-        """Radii and places along the axle (SPHERES,) [m] of spheres that touch it from within."""
+        """Radii (SPHERES,) of inscribed spheres and their places along the axle (SPHERES,) [m]."""
         a = self.across
         b = self.along
         places = np.linspace(-ROLLER_END, ROLLER_END, SPHERES) * (b - a * a / b)
@@ -244,13 +268,13 @@ class Roller:
 
     @property
     def inertia(self) -> float:
-        """About its middle, with the rotor's [kg m^2]."""
+        """Moment of inertia about its centre, including the rotor's [kg m^2]."""
         across = 0.2 * ROLLER_MASS * (self.across**2 + self.along**2)
         return across + ROTOR_INERTIA
 
 
 def place_rollers(radius: float, rollers: int, lean: int) -> list[Roller]:
-    """Places the rollers of a mecanum wheel; for `lean` see `Wheel`."""
+    """Places the rollers of a mecanum wheel; `lean`: see `Wheel`."""
     across, along = fit_roller(radius, rollers)
     placed = []
     for angle in 2.0 * np.pi * np.arange(rollers) / rollers:

@@ -1,4 +1,4 @@
-"""A world as solids that every physics engine has: upright boxes, cylinders and convex prisms."""
+"""A world as solids that every physics engine supports: upright boxes, cylinders, convex prisms."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -58,6 +58,16 @@ class Prism:
 
 
 Solid = Box | Cylinder | Prism
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """An obstacle of a scene."""
+
+    number: int  # row of the scene's bodies
+    shape: Shape
+    pose: Array  # (3,) x [m], y [m], heading [rad]
+    moves: bool
 
 
 def cut_world(world: World) -> Iterator[Box]:

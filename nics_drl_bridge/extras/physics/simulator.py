@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,11 +12,13 @@ from numpy.typing import ArrayLike
 from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.extras.physics.driven import DrivenSimulator
-from nics_drl_bridge.extras.physics.machines import Machine, Physics
+from nics_drl_bridge.extras.physics.machines import Machine, Physics, design_machine
+from nics_drl_bridge.extras.physics.scenery import Box, Obstacle, cut_world
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar import fault_kernels
 from nics_drl_bridge.lidar.arrays import Integers, Singles
+from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import HOLD_S, ROW_S
@@ -108,10 +110,10 @@ class Rig(ABC):
 
 
 class ServoRig(Rig):
-    """A rig whose motors hold speeds while the tyres can, set again before each time step.
+    """A rig whose motors are speed servos, with new set points before each time step.
 
     The speeds follow a wanted state with the motors' lags. A differential between driven wheels
-    gives each the speed of its own circle.
+    gives each wheel the speed for its turning radius.
     """
 
     def __init__(self, spec: RobotSpec, machine: Machine, timestep: float) -> None:
@@ -184,8 +186,10 @@ class PhysicsSimulator(DrivenSimulator, ABC):
 
     Commands act on motors with their own lag, so the model's latency is not added. A randomisation
     adds its latency, but its factors on the model's kinematics have no effect. Raises ConfigError
-    if the engine, textbook kinematics, a parameter of the machine or free space is missing.
+    if textbook kinematics, a parameter of the machine or free space is missing.
     """
+
+    engine: str  # name of the engine
 
     def __init__(
         self,
@@ -200,19 +204,31 @@ class PhysicsSimulator(DrivenSimulator, ABC):
             model.control_period, physics.timestep
         )
         self._physics = replace(physics, timestep=timestep)
-        self._machine = self.design(model.robot, self._physics)
+        self._machine = design_machine(model.robot, self._physics, self.engine)
         self._twist = textbook(model.robot).twist
-        drawn: Any = {"renderer": renderer, "randomisation": randomisation}
-        super().__init__(model, world, robots=robots, **drawn)
+        super().__init__(
+            model,
+            world,
+            robots=robots,
+            renderer=renderer,
+            randomisation=randomisation,
+        )
         self.reset([0])
 
     @abstractmethod
-    def design(self, spec: RobotSpec, physics: Physics) -> Machine:
-        """Prepares the machine of all robots."""
-
-    @abstractmethod
     def compile(self, bodies: Array) -> list[Any]:
-        """Builds the scene with obstacles (K, 7), and returns the rigs of robots to be placed."""
+        """Builds the scene with obstacles (K, 7); returns the robots' rigs, not yet placed."""
+
+    def list_walls(self) -> Iterator[Box]:
+        """Yields the walls and the map of this episode's world."""
+        return cut_world(self.world.members[int(self.data.member[0])])
+
+    def list_obstacles(self, bodies: Array) -> Iterator[Obstacle]:
+        """Yields the obstacles that there are among bodies (K, 7)."""
+        motions = self.sampler.motions[int(self.data.member[0])]
+        for k in np.flatnonzero(bodies[:, RADIUS] > 0.0).tolist():
+            shape = self.sampler.shapes[int(bodies[k, SHAPE])]
+            yield Obstacle(k, shape, bodies[k, :3], motions[k] is not None)
 
     def refresh(self) -> None:
         """Updates derived values after the robots were placed."""
@@ -293,33 +309,38 @@ class PhysicsSimulator(DrivenSimulator, ABC):
         wheels = self.wheels.copy()
         counted = np.zeros((len(rigs), 3))
         touched = np.zeros(len(rigs), np.bool_)
-        turned = [rig.encoders() for rig in rigs]
-        facing = [rig.heading() for rig in rigs]
+        joints = [rig.encoders() for rig in rigs]
+        headings = [rig.heading() for rig in rigs]
         for part in range(self._subperiods):
             for rig, command in zip(rigs, self.in_force(part * part_s), strict=True):
                 rig.command(command)
             self.place_obstacles(self.move_obstacles((part + 1) * part_s))
             touched[self.advance(self._steps)] = True
-            before = turned
-            turned = [rig.encoders() for rig in rigs]
-            faced = facing
-            facing = [rig.heading() for rig in rigs]
-            pairs = zip(before, turned, strict=True)
-            mean = self._machine.state
-            means = [
-                mean(0.5 * (first + last), (last - first) / part_s)
-                for first, last in pairs
-            ]
-            counted = self._twist(np.array(means)) * self._machine.calibrated
-            if self._machine.gyro:
-                turned_by = geometry.wrap_angle(np.subtract(facing, faced))
-                counted[:, 2] = turned_by / part_s + self._draw_gyro_errors()
+            counted = self._measure_twists(joints, headings, part_s)
+            joints = [rig.encoders() for rig in rigs]
+            headings = [rig.heading() for rig in rigs]
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
         readings = [rig.read() for rig in rigs]
         pose, twist, state = (
             np.array([getattr(r, n) for r in readings]) for n in MOTION
         )
         self.end_period(pose, twist, state, wheels, counted, touched)
+
+    def _measure_twists(
+        self, joints: Sequence[Array], headings: Sequence[float], part_s: float
+    ) -> Array:
+        """Returns twists (M, 3) by wheel odometry, since the joints and headings before."""
+        states = []
+        for rig, before in zip(self._rigs, joints, strict=True):
+            now = rig.encoders()
+            mean = self._machine.state(0.5 * (before + now), (now - before) / part_s)
+            states.append(mean)
+        twists = self._twist(np.array(states)) * self._machine.calibrated
+        if self._machine.gyro:
+            turned = np.subtract([rig.heading() for rig in self._rigs], headings)
+            rates = geometry.wrap_angle(turned) / part_s
+            twists[:, 2] = rates + self._draw_gyro_errors()
+        return np.asarray(twists)
 
     def _draw_gyro_errors(self) -> Array:
         physics = self._physics
@@ -330,7 +351,7 @@ class PhysicsSimulator(DrivenSimulator, ABC):
 class RayCastingSimulator(PhysicsSimulator):
     """A PhysicsSimulator whose engine also casts the lidar's rays.
 
-    Scans that are late or skewed are the FastSimulator's, because they need the past.
+    Late or skewed scans are those of the FastSimulator, because they depend on past poses.
     """
 
     @abstractmethod

@@ -93,11 +93,11 @@ class Engine:
         self.world = dartpy.simulation.World()
         self.world.setTimeStep(STEP_S)
         self.world.setCollisionDetector(dartpy.simulation.CollisionDetectorType.ODE)
-        ground = scenery.add_fixed_body(dartpy, self.world, "ground")
+        ground = scenery.add_fixed_body(self.world, "ground")
         slab = dartpy.dynamics.BoxShape([80.0, 80.0, 0.2])
-        below = scenery.make_transform(dartpy, [0.0, 0.0, -0.1])
+        below = scenery.make_transform([0.0, 0.0, -0.1])
         scenery.let_touch(scenery.add_shape(ground, slab, below), friction=1.0)
-        self._seen = scenery.make_group(dartpy, self._add_walls(size, pillars))
+        self._seen = scenery.make_group(self._add_walls(size, pillars))
         self._robot = dartpy.utils.DartLoader().parseSkeletonString(write_robot(), "")
         self._base = self._robot.getBodyNode("base_link")
         self._prepare_wheels()
@@ -107,7 +107,7 @@ class Engine:
         self.wheel_speeds = np.zeros(4)  # asked of the motors [rad/s]
 
     def _add_walls(self, size: Sequence[float], pillars: Sequence[Any]) -> list[Any]:
-        body = scenery.add_fixed_body(dartpy, self.world, "walls")
+        body = scenery.add_fixed_body(self.world, "walls")
         length, width = np.array(size) + THICK
         solids: list[tuple[Any, Array]] = []
         for sign in (-0.5, 0.5):
@@ -117,7 +117,7 @@ class Engine:
         for x, y, radius in pillars:
             solids.append((Cylinder(radius), np.array([x, y, 0.0])))
         return [
-            scenery.add_solid(dartpy, body, solid, LEVEL, height=1.0, pose=pose)
+            scenery.add_solid(body, solid, LEVEL, height=1.0, pose=pose)
             for solid, pose in solids
         ]
 
@@ -183,7 +183,7 @@ class Engine:
 
     def cast_scan(self) -> Array:
         """Returns the ranges (B,) [m] of the lidar, without noise."""
-        return scenery.cast_scan(dartpy, self._seen, LIDAR, self.pose, LEVEL)
+        return scenery.cast_scan(self._seen, LIDAR, self.pose, LEVEL)
 
 
 class Driver(SpunNode):

@@ -25,8 +25,9 @@ from nics_drl_bridge.extras.physics.machines import (
     Physics,
     Roller,
     Wheel,
-    design_machine,
     place_rollers,
+    weigh_chassis,
+    weigh_wheel,
 )
 from nics_drl_bridge.extras.physics.scenery import (
     BUMPER_FRICTION,
@@ -36,7 +37,6 @@ from nics_drl_bridge.extras.physics.scenery import (
     Solid,
     aim_beams,
     cut_shape,
-    cut_world,
     make_scan,
 )
 from nics_drl_bridge.extras.physics.simulator import (
@@ -47,10 +47,15 @@ from nics_drl_bridge.extras.physics.simulator import (
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.arrays import Singles
-from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
+
+try:
+    import pybullet
+except ImportError:
+    fix = "with Python 3.11, run pip install pybullet==3.2.7"
+    raise ConfigError(f"PyBullet is not installed; {fix}.") from None
 
 PHYSICS = Physics(timestep=0.002)
 GRAVITY = 9.81  # [m/s^2]
@@ -71,22 +76,11 @@ FRACTION = 2  # index of the fraction of a ray in one of PyBullet's results
 STANDS_STILL = {"linearDamping": 0.0, "angularDamping": 0.0, "jointDamping": 0.0}
 
 
-def load_pybullet() -> Any:
-    """Returns the module `pybullet`. Raises ConfigError if it is not installed."""
-    try:
-        import pybullet
-    except ImportError:
-        fix = "with Python 3.11, run pip install pybullet==3.2.7"
-        raise ConfigError(f"PyBullet is not installed; {fix}.") from None
-    return pybullet
-
-
 class Engine:
     """PyBullet without a window, with a world of its own; it has all functions of the module."""
 
     def __init__(self, physics: Physics) -> None:
-        self._bullet = load_pybullet()
-        self._client = self._bullet.connect(self._bullet.DIRECT)
+        self._client = pybullet.connect(pybullet.DIRECT)
         self.setGravity(0.0, 0.0, -GRAVITY)
         self.setPhysicsEngineParameter(
             fixedTimeStep=physics.timestep,
@@ -95,13 +89,13 @@ class Engine:
         )
 
     def __getattr__(self, name: str) -> Any:
-        value = getattr(self._bullet, name)
+        value = getattr(pybullet, name)
         return (
             partial(value, physicsClientId=self._client) if callable(value) else value
         )
 
     def __del__(self) -> None:
-        self._bullet.disconnect(self._client)
+        pybullet.disconnect(self._client)
 
 
 def let_touch(
@@ -204,30 +198,22 @@ class Assembly:
             parent = self._add(Link(0, place, PIVOT_MASS, moment, axis=Z))
             self.joints[wheel.steering] = parent
             place = (0.0, 0.0, 0.0)
-        mass = self.physics.wheel_mass
-        width = 0.4 * radius
+        mass, moment = weigh_wheel(wheel, self.machine, self.physics)
         tyre = -1
-        if wheel.lean:
-            mass -= self.physics.rollers * ROLLER_MASS
-            radius *= 0.7
-        else:
+        if not wheel.lean:
             tyre = self.engine.createCollisionShape(
                 self.engine.GEOM_SPHERE, radius=radius
             )
-        across = mass * (3.0 * radius**2 + width**2) / 12.0
-        rolling = 0.5 * mass * radius**2
         if self.machine.kind == "skid_steer":
             # PyBullet weighs the directions of friction by the inertia that is felt along each. A
             # wheel whose motor holds its speed is felt as the robot; a light one would not skid.
-            rolling = self.physics.mass * radius**2
-        moment = np.array([across, rolling, across])
+            moment[1] = self.physics.mass * radius**2
         number = self._add(Link(parent, place, mass, moment, tyre, Y))
         self.joints[wheel.name] = number
         if not wheel.lean:
             self.friction[number] = self.physics.friction
             return
-        sizes = self.machine.radius, self.physics.rollers, wheel.lean
-        for roller in place_rollers(*sizes):
+        for roller in place_rollers(radius, self.physics.rollers, wheel.lean):
             self._add_roller(number, roller)
 
     def _add_roller(self, wheel: int, roller: Roller) -> None:
@@ -247,8 +233,6 @@ class Assembly:
         engine = self.engine
         machine = self.machine
         mass = self.physics.mass
-        squares = np.square(machine.size)
-        moment = mass * (squares.sum() - squares) / 12.0
         turning = {True: engine.JOINT_REVOLUTE, False: engine.JOINT_FIXED}
         still = [0.0, 0.0, 0.0, 1.0]
         links = self.links
@@ -266,7 +250,10 @@ class Assembly:
             linkJointTypes=[turning[link.axis is not None] for link in links],
             linkJointAxis=[Z if link.axis is None else link.axis for link in links],
         )
-        moments = [moment, *(link.moment for link in links)]
+        moments = [
+            weigh_chassis(machine, self.physics),
+            *(link.moment for link in links),
+        ]
         for number, one in enumerate(moments, BASE):
             inertia = np.asarray(one).tolist()
             engine.changeDynamics(
@@ -398,6 +385,8 @@ class PybulletRig(ServoRig):
 class PybulletSimulator(RayCastingSimulator):
     """One world with one robot in PyBullet."""
 
+    engine = "PyBullet"
+
     def __init__(
         self,
         model: SimulatorModel,
@@ -405,12 +394,7 @@ class PybulletSimulator(RayCastingSimulator):
         physics: Physics = PHYSICS,
         randomisation: Randomisation | None = None,
     ) -> None:
-        load_pybullet()
         super().__init__(model, world, 1, physics, randomisation=randomisation)
-
-    def design(self, spec: RobotSpec, physics: Physics) -> Machine:
-        """See `PhysicsSimulator`."""
-        return design_machine(spec, physics, "PyBullet")
 
     def compile(self, bodies: Array) -> list[PybulletRig]:
         """See `PhysicsSimulator`."""
@@ -419,16 +403,15 @@ class PybulletSimulator(RayCastingSimulator):
             0.0, engine.createCollisionShape(engine.GEOM_PLANE)
         )
         let_touch(engine, floor, BASE, FLOOR, 1.0)
-        member = int(self.data.member[0])
-        for solid in cut_world(self.world.members[member]):
-            self._place(self._add_obstacle(solid), solid, ORIGIN)
+        for wall in self.list_walls():
+            self._place(self._add_obstacle(wall), wall, ORIGIN)
         self._moving: list[tuple[int, int, Solid]] = []
-        for k in np.flatnonzero(bodies[:, RADIUS] > 0.0).tolist():
-            for solid in cut_shape(self.sampler.shapes[int(bodies[k, SHAPE])]):
+        for obstacle in self.list_obstacles(bodies):
+            for solid in cut_shape(obstacle.shape):
                 body = self._add_obstacle(solid)
-                self._place(body, solid, bodies[k, :3])
-                if self.sampler.motions[member][k] is not None:
-                    self._moving.append((k, body, solid))
+                self._place(body, solid, obstacle.pose)
+                if obstacle.moves:
+                    self._moving.append((obstacle.number, body, solid))
         assembly = Assembly(engine, self._machine, self._physics)
         return [assembly.build(self.model.robot)]
 

@@ -2,12 +2,13 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.extras.dart.simulator import DartRobot
 from nics_drl_bridge.robot.spec import load_robot
 
 from ..physics.driving import drive_steadily
 
 pytest.importorskip("dartpy", reason="needs DART: the extra `dart`")
+
+from nics_drl_bridge.extras.dart.simulator import DartRobot
 
 WHEEL = """
 <link name="{name}"><inertial><mass value="2.6"/>

@@ -173,37 +173,6 @@ def test_turn_rates_become_the_steering_angles_of_a_car(tmp_path, name):
     assert policy.command(rows) == pytest.approx(wanted, abs=1e-5)
 
 
-def test_sizes_that_follow_from_shapes_are_known(tmp_path, robot):
-    """The first half of four numbers, cut as PyTorch's exporter writes `chunk`."""
-    node = onnx.helper.make_node
-    nodes = [
-        node("MatMul", ["goal", "weights"], ["four"]),
-        node("Shape", ["four"], ["shape"]),
-        node("Gather", ["shape", "last"], ["size"], axis=0),
-        node("Add", ["size", "one"], ["more"]),
-        node("Div", ["more", "two"], ["half"]),
-        node("Slice", ["four", "zero", "half", "last"], ["action"]),
-    ]
-    numbers = {"zero": [0], "one": [1], "two": [2], "last": [-1]}
-    weights = {name: np.int64(values) for name, values in numbers.items()}
-    weights["weights"] = np.float32([[0.1, -0.1, 9.0, 9.0], [0.3, 0.1, 9.0, 9.0]])
-    # An input may be an output, too.
-    ends = {"action": ["n", "half"], "goal": ["n", 2]}
-    made = nets.model_of(nodes, {"goal": ["n", 2]}, ends, weights)
-    write_bytes(tmp_path / "net.onnx", made.SerializeToString())
-    data = nets.three_mapping()
-    data["inputs"] = {"goal": {"parts": [{"of": "goal.x"}, {"of": "goal.y"}]}}
-    turn = {"of": "goal", "index": 1, "clip": [-0.5, 0.5]}
-    data["outputs"] = {"forward": {"of": "action", "clip": [0.0, 0.4]}, "turn": turn}
-    path = write_mapping(tmp_path, data)
-    rows, bearing = seen()
-    x = rows[:, SECTORS] * np.cos(bearing)
-    y = rows[:, SECTORS] * np.sin(bearing)
-    wanted = [np.clip(0.1 * x + 0.3 * y, 0.0, 0.4), np.clip(y, -0.5, 0.5)]
-    found = commands_of(path, robot, rows)
-    assert found == pytest.approx(np.stack(wanted, axis=-1), abs=1e-5)
-
-
 # It is a policy like any other.
 
 

@@ -101,11 +101,7 @@ def test_the_bundle_says_what_it_needs(tmp_path):
     assert command["limits"] == [[-2.0, 2.0]] * 3
 
 
-@pytest.mark.slow
 def test_nics_policy_exports_and_imports_what_is_shipped(tmp_path):
-    for file in sorted(shipped().glob("*.onnx")):
-        export_bundle(load_policy(file.stem), tmp_path / file.stem)
-        assert import_policy(tmp_path / file.stem) == file.read_bytes()
     words = ("policy", "export", "differential", "--leapp", "bundle", "--json")
     (written,) = json.loads(nics(*words, cwd=tmp_path).stdout).values()
     assert (tmp_path / written).parent.name == "bundle"
@@ -291,11 +287,18 @@ def test_what_leapp_itself_traces_becomes_a_policy_file(tmp_path):
         assert command == pytest.approx(out["walk/action"].detach().numpy(), abs=1e-6)
 
 
-def test_a_bundle_of_others_is_driven_by_a_mapping_too(tmp_path):
-    bundle = write_foreign(tmp_path)
+@pytest.mark.parametrize(
+    ("unit", "divisor"), [("m", 1.0), ("fraction of range_max", 3.0), ("share", 3.0)]
+)
+def test_a_bundle_of_others_is_driven_by_a_mapping_too(tmp_path, unit, divisor):
+    bundle = write_foreign(
+        tmp_path, lambda data, _: node(data, "scaling", "inputs", 0, unit=unit)
+    )
     model = direct_model()
     path = tmp_path / "mapping.yaml"
-    mapping = leapp_import.mapping_of(leapp_import.read_bundle(bundle), model)
+    mapping = leapp_import.derive_mapping(leapp_import.read_bundle(bundle), model)
+    (scan,) = mapping["inputs"]["scan"]["parts"]
+    assert scan == {"of": "scan", "divide": divisor}
     write_text(path, dump_yaml(mapping))
     mine = load_policy(path, model)
     theirs = policy_of(import_policy(bundle, model), tmp_path / "ours.onnx")

@@ -1,19 +1,20 @@
 import numpy as np
 import pytest
-from robots import direct_model
 
 pytest.importorskip("mujoco", reason="needs MuJoCo: the extra `mujoco`")
 
 import mujoco
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
+from nics_drl_bridge.extras.mujoco.simulator import MujocoRobot, MujocoSimulator
+from nics_drl_bridge.extras.physics.simulator import record
 from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.lidar.exact_kernels import X, Y
+from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import World, load_world
+from nics_drl_bridge.sim.world import load_world
 from nics_drl_bridge.sim.world_set import load_worlds
 
 from ..physics.driving import drive, forward
@@ -50,33 +51,20 @@ def test_each_episode_of_a_set_of_worlds_begins_as_in_the_fast_simulator():
     assert members == {0, 1, 2}
 
 
-def test_a_latency_that_is_drawn_delays_the_motors_and_the_rest_is_drawn_as_elsewhere():
+def test_a_latency_that_is_drawn_delays_the_motors():
     model = builtin_model("differential")
     world = load_world("empty")
-    late = Randomisation(
-        name="late",
-        action_latency=(1.0, 1.0),
-        lidar={"dropout": (0.5, 0.5)},
-        odometry={"odom_linear": (0.1, 0.1)},
-    )
-    ours, theirs = (
-        kind(model, world, randomisation=late)
-        for kind in (MujocoSimulator, FastSimulator)
-    )
-    prompt = MujocoSimulator(model, world)
-    for simulator in (ours, theirs, prompt):
-        simulator.reset([3])
-    assert np.array_equal(ours.data.noise, theirs.data.noise)
-    assert np.array_equal(ours.data.ranges, theirs.data.ranges)
-    assert np.isinf(ours.data.ranges).sum() > 0.4 * model.lidar.beams
-    start = ours.data.pose[0, 0, :2].copy()
+    late = Randomisation(name="late", action_latency=(1.0, 1.0))
     distances = []
-    for simulator in (ours, prompt):
-        distances.append([])
+    for drawn in (late, None):
+        simulator = MujocoSimulator(model, world, randomisation=drawn)
+        simulator.reset([3])
+        start = simulator.data.pose[0, 0, :2].copy()
+        places = []
         for _ in range(4):
             drive(simulator, forward(model, 0.5), 1)
-            distance = np.linalg.norm(simulator.data.pose[0, 0, :2] - start)
-            distances[-1].append(distance)
+            places.append(simulator.data.pose[0, 0, :2].copy())
+        distances.append(np.linalg.norm(places - start, axis=1))
     delayed, at_once = distances
     assert delayed[0] < 1e-3 < at_once[0]
     # the same, a period later
@@ -147,11 +135,13 @@ def test_moving_obstacles_stand_in_mujoco_where_they_are_seen():
     drive(simulator, forward(model, 0.0), 10)
     now = simulator.obstacles[0]
     assert np.hypot(*(now - began[0])[:, :2].T).max() > 0.2
-    for k, mocap in simulator._mocap:
+    for k, mocap in simulator._mocap.items():
         assert simulator._data.mocap_pos[mocap, :2] == pytest.approx(now[k, [X, Y]])
 
 
-def test_a_robot_without_textbook_kinematics_is_no_machine():
-    world = World(name="plain", size=(8.0, 8.0), goal_distance=(1.0, 2.0))
-    with pytest.raises(ConfigError, match="no textbook kinematics"):
-        MujocoSimulator(direct_model(), world)
+def test_a_model_is_identified_from_a_drive():
+    robot = MujocoRobot(load_robot("differential"))
+    drive = record(robot, np.random.default_rng(0), 20.0)
+    found = identify(drive, robot.spec)
+    assert found.held_out is not None
+    assert found.held_out.mean_position_error_m < 0.03 * found.held_out.mean_path_m

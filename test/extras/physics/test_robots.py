@@ -1,20 +1,21 @@
 """A robot on an infinite floor, in each engine."""
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from robots import DIRECT
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.extras.physics.machines import Physics, design_machine, fit_roller
 from nics_drl_bridge.extras.physics.simulator import PhysicsRobot, record
 from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 from .driving import drive_steadily
-from .engines import ENGINES, Engine, list_rows
+from .engines import Engine, list_rows
 
 NAMES = ("ackermann", "differential", "mecanum", "jackal")
 
@@ -154,9 +155,24 @@ def test_a_drive_is_a_recording_of_this_robot(engine, robots):
     assert [len(stream.t) for stream in streams] == [200] * 3
 
 
-@pytest.mark.parametrize("engine", ENGINES, ids=lambda engine: engine.name)
-def test_a_missing_library_is_one_sentence_that_names_the_fix(engine, monkeypatch):
-    monkeypatch.setitem(sys.modules, engine.library, None)
-    command = rf"pip install 'nics_drl_bridge\[{engine.extra}\]'"
-    with pytest.raises(ConfigError, match=command):
-        engine.load()
+def test_rollers_make_a_wheel_round():
+    radius = 0.05
+    count = 12
+    a, b = fit_roller(radius, count)
+    q = np.linspace(0.0, np.pi / count, 50)
+    reach = (radius - a) * np.cos(q) + np.sqrt(
+        a**2 + (b**2 - a**2) * np.sin(q) ** 2 / 2.0
+    )
+    assert reach == pytest.approx(radius, rel=2e-3)
+    assert reach[[0, -1]] == pytest.approx(radius)
+
+
+def test_what_makes_no_machine_is_refused_by_its_name():
+    data = load_robot("ackermann").model_dump()
+    del data["parameters"]["wheelbase"]
+    for robot, reason in (
+        (RobotSpec.model_validate(data), "wheelbase"),
+        (DIRECT, "no textbook kinematics"),
+    ):
+        with pytest.raises(ConfigError, match=reason):
+            design_machine(robot, Physics(), "MuJoCo")

@@ -108,16 +108,21 @@ def test_wheel_odometry_is_wrong_after_a_turn_in_which_the_wheels_skid(engine):
     assert errors["ice"] > 0.1
 
 
-def test_lidar_faults_are_drawn_as_in_the_fast_simulator(engine):
+def test_faults_of_sensors_are_drawn_as_in_the_fast_simulator(engine):
     model = builtin_model("differential")
     world = load_world("empty")
-    faulty = Randomisation(name="faulty", lidar={"dropout": (0.5, 0.5)})
+    faulty = Randomisation(
+        name="faulty",
+        lidar={"dropout": (0.5, 0.5)},
+        odometry={"odom_linear": (0.1, 0.1)},
+    )
     ours = engine.simulator(model, world, randomisation=faulty)
     theirs = FastSimulator(model, world, randomisation=faulty)
     ours.reset([3])
     theirs.reset([3])
     lost = np.isinf(ours.data.ranges)
     assert np.array_equal(lost, np.isinf(theirs.data.ranges))
+    assert np.array_equal(ours.data.noise, theirs.data.noise)
     assert lost.sum() > 0.4 * model.lidar.beams
 
 
