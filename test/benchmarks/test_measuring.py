@@ -29,16 +29,13 @@ BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 NAN = float("nan")
 
 
-@pytest.fixture(autouse=True)
-def path(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-
+sys.path.insert(0, str(BENCHMARKS))
 
 # Drives of robots of other simulators
 
 
-@pytest.fixture
-def foreign(path):
+@pytest.fixture(scope="module")
+def foreign():
     return import_module("measuring.foreign_robots")
 
 
@@ -85,14 +82,13 @@ def test_every_mapping_that_is_shown_has_its_drive():
 # The league
 
 
-@pytest.fixture
-def lesson(foreign, tmp_path):
+@pytest.fixture(scope="module")
+def lesson(foreign, tmp_path_factory):
     """A drive of 40 s of a robot of another simulator, its textbook fitted to 26 s of it."""
     league = import_module("measuring.league")
-    mapping = foreign.foreign_drive(foreign.ROBOTS["ticks"], 3, 40.0).write(
-        tmp_path / "ticks"
-    )
-    spec, recording = open_drive(tmp_path / "ticks", None, mapping)
+    folder = tmp_path_factory.mktemp("lesson") / "ticks"
+    mapping = foreign.foreign_drive(foreign.ROBOTS["ticks"], 3, 40.0).write(folder)
+    spec, recording = open_drive(folder, None, mapping)
     drive = Drive(recording, spec)
     return league.Lesson(drive, 26.0, fit_yardstick(drive, 26.0))
 
@@ -108,6 +104,8 @@ def test_what_others_fit_predicts_a_drive_that_it_did_not_see(
 ):
     league = import_module("measuring.league")
     monkeypatch.setattr(league, "WINDOWS", 8)
+    monkeypatch.setattr(league, "DEGREES", (1,))
+    monkeypatch.setattr(league, "RIDGES", (1.0,))
     pytest.importorskip(league.PACKAGES[name], reason="comes with the extra test")
     ends = league.ENTRANTS[name](lesson)(unseen)
     assert league.average_errors(ends, unseen)[1] < share
@@ -129,7 +127,7 @@ def test_the_league_counts_first_places_and_those_within_five_per_cent():
 
 
 @pytest.fixture
-def scenes(path):
+def scenes():
     return import_module("measuring.scenes")
 
 
@@ -186,7 +184,7 @@ def test_a_peer_that_crashes_or_ends_is_a_missed_bar_and_no_hang(
 
 
 @pytest.fixture
-def policies(path):
+def policies():
     return import_module("policies")
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -62,10 +63,7 @@ def read_bag_info(path: str | Path) -> BagInfo:
             _describe_topic(t, bag.types[t], ns - start, s)
             for t, (ns, s) in received.items()
         )
-    if path.is_file():
-        files = [path]
-    else:
-        files = [file for file in path.iterdir() if file.is_file()]
+    files = [path] if path.is_file() else filter(Path.is_file, path.iterdir())
     size = sum(file.stat().st_size for file in files)
     return BagInfo(str(path), size, start, (end - start) * S_PER_NS, len(times), topics)
 
@@ -84,24 +82,11 @@ def _read_receipt(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | 
 def _describe_topic(
     topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str
 ) -> BagTopic:
-    clock = delays if isinstance(delays, str) else ""
-    delay = None
-    jitter = None
-    backwards = 0
+    clock: dict[str, Any] = {"clock": delays}
     if not isinstance(delays, str):
-        low, middle, high = np.percentile(delays * S_PER_NS, (5.0, 50.0, 95.0))
-        delay = float(middle)
-        jitter = float(high - low)
-        backwards = int((np.diff(since - delays) < 0).sum())
-        near = SAME_CLOCK_S[0] <= delay <= SAME_CLOCK_S[1]
-        if jitter > MAX_WANDER_S:
-            clock = SEVERAL
-        elif near:
-            clock = RECORDER
-        else:
-            clock = FOREIGN
+        clock = _describe_clock(since, delays)
     if not len(since):
-        return BagTopic(topic, kind, 0, clock=clock)
+        return BagTopic(topic, kind, 0, **clock)
     intervals = np.diff(since) * S_PER_NS
     usual = float(np.median(intervals)) if len(intervals) else 0.0
     return BagTopic(
@@ -113,8 +98,20 @@ def _describe_topic(
         last_s=float(since[-1] * S_PER_NS),
         gaps=int((intervals > GAP * usual).sum()) if usual > 0.0 else 0,
         longest_gap_s=float(intervals.max()) if len(intervals) else None,
-        clock=clock,
-        delay_s=delay,
-        jitter_s=jitter,
-        backwards=backwards,
+        **clock,
     )
+
+
+def _describe_clock(since: Nanoseconds, delays: Nanoseconds) -> dict[str, Any]:
+    low, middle, high = np.percentile(delays * S_PER_NS, (5.0, 50.0, 95.0)).tolist()
+    clock = FOREIGN
+    if high - low > MAX_WANDER_S:
+        clock = SEVERAL
+    elif SAME_CLOCK_S[0] <= middle <= SAME_CLOCK_S[1]:
+        clock = RECORDER
+    return {
+        "clock": clock,
+        "delay_s": middle,
+        "jitter_s": high - low,
+        "backwards": int((np.diff(since - delays) < 0).sum()),
+    }

@@ -68,7 +68,7 @@ ALONE_S = 5.0  # maximum wait for a subscriber before playing without one [s]
 
 
 def collect_message_texts(kind: str) -> dict[str, str]:
-    """Return the `.msg` texts of a type and of the types in it, as far as they are installed."""
+    """Returns the `.msg` texts of a type and of the types in it, as far as they are installed."""
     texts: dict[str, str] = {}
     waiting = [kind]
     while waiting:
@@ -367,20 +367,13 @@ def play_bag(
     node = Node("bag_player", context=context, start_parameter_services=False)
     try:
         player = _Player(node, stopping, rate, clock, namespace, lockstep)
-        played = {
-            t: m for t, m in messages.items() if player.offer(t, kinds[t], offers[t])
-        }
-        for topic in sorted(kinds.keys() - played.keys()):
-            say(
-                f"left out: {topic} is of {kinds[topic]}, whose package is not installed."
-            )
-        # Sort by receive time, then by topic.
-        timed = [
-            (ns, topic, data)
-            for topic, rows in sorted(played.items())
-            for ns, data in rows
-        ]
-        timed.sort(key=lambda one: one[:2])
+        timed: list[Timed] = []
+        for topic, kind in kinds.items():
+            if player.offer(topic, kind, offers[topic]):
+                timed += ((ns, topic, data) for ns, data in messages[topic])
+            else:
+                say(f"left out: {topic} is of {kind}, whose package is not installed.")
+        timed.sort(key=lambda message: message[:2])  # by receive time, then by topic
         if not timed:
             raise RecordingError(f"{path}: contains nothing that can be played here.")
         player.ready()
