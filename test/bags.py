@@ -201,17 +201,18 @@ def write(
     compression: str = "none",
     version: int = 9,
     kinds_of: dict[str, str] | None = None,
+    store: Any = STORE,
 ) -> Path:
-    """Writes a bag; an empty topic needs its type in `kinds_of`."""
+    """Writes a bag of types in `store`; an empty topic needs its type in `kinds_of`."""
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     writer = Writer(path, version=version, storage_plugin=plugin)
     writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
     with writer:
         for topic, rows in topics.items():
             kind = rows[0][1].__msgtype__ if rows else (kinds_of or {})[topic]
-            connection = writer.add_connection(topic, kind, typestore=STORE)
+            connection = writer.add_connection(topic, kind, typestore=store)
             for t, message in rows:
-                writer.write(connection, ns(t), STORE.serialize_cdr(message, kind))
+                writer.write(connection, ns(t), store.serialize_cdr(message, kind))
     return path
 
 

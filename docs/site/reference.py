@@ -23,7 +23,7 @@ from nics_drl_bridge.lidar.maps import MapFile
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes.parameters import GREATEST_SEED, NODES, STAMPED, Row
 from nics_drl_bridge.policy.train.settings import TrainingSettings
-from nics_drl_bridge.recording.mapping import Mapping
+from nics_drl_bridge.recording.mapping import DriveMapping
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import RobotSpec, list_kinds
 from nics_drl_bridge.sim.randomisation import Randomisation
@@ -69,7 +69,7 @@ KINDS = {
     "lidar": Kind("Lidar file", LidarSpec, "config/lidars/rplidar_a2.yaml", "lidar"),
     "mapping": Kind(
         "Mapping of a recording",
-        Mapping,
+        DriveMapping,
         "examples/recordings/jetracer_csv.yaml",
         "recordings",
     ),

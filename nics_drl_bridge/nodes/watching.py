@@ -127,7 +127,7 @@ class RosSource:
             gate=self._gate,
         )
         state = "" if heard else "waiting for topics"
-        world = WorldFrame(shot, self._title, 0, self._trail.ways, state)
+        world = WorldFrame(shot, self._title, 0, self._trail.paths, state)
         return Frame(
             view.stamp_s, (world,), f"hears {', '.join(heard)}" if heard else ""
         )

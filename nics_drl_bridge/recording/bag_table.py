@@ -176,8 +176,8 @@ class Bag(Source):
         self._notes: dict[str, list[str]] = {}  # by topic
         self._stamps: dict[tuple[str, ...], Stream] = {}
 
-    def use(self, mapping: mapped.Mapping) -> None:
-        """Stamps the topics of a mapping together; call this before reading them."""
+    def use(self, mapping: mapped.DriveMapping) -> None:
+        """Stamps the topics of a mapping together."""
         self._frames = mapping.pose.frames
         self._used = list_topics_used(mapping, self.names)
 
@@ -254,7 +254,9 @@ class Bag(Source):
             return stamp_streams(data, stamps, self.place, robot)[topic]
 
 
-def list_topics_used(mapping: mapped.Mapping, topics: Sequence[str]) -> dict[str, bool]:
+def list_topics_used(
+    mapping: mapped.DriveMapping, topics: Sequence[str]
+) -> dict[str, bool]:
     """Returns the topics that a mapping names, and whether `ROBOT_STREAMS` use them."""
     used: dict[str, bool] = {}
     parts = mapping.model_dump(by_alias=True, exclude={"robot"}, exclude_none=True)

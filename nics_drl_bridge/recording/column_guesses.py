@@ -499,11 +499,9 @@ def guess_command(
             candidates += _find_unexplained(table, len(tables) > 1, pose)
     kind, named = _choose_kind(candidates)
     if kind is None:
-        strongest = sorted(candidates, key=lambda column: -column.strength)
-        named = {
-            f"command_{k}": candidate
-            for k, candidate in enumerate(strongest[:MOST_CANDIDATES])
-        }
+        candidates.sort(key=lambda column: -column.strength)
+        for candidate in candidates[:MOST_CANDIDATES]:
+            named[f"command_{len(named)}"] = candidate
     return CommandGuess(kind, {}, named)
 
 

@@ -36,8 +36,8 @@ TOLERANCE_M = 0.005
 # Turning back uses fractions of the maximum commands, as a reserve for a robot that turns less.
 TURNING_SPEED = 0.5
 TURNING = 0.8
-WAY_S = (3.0, 20.0)
-WAY_STEP_S = 0.1
+RETURN_S = (3.0, 20.0)
+RETURN_STEP_S = 0.1
 # A path back starts within a fraction of the circle's radius, or reaches a fraction of its initial
 # distance from the centre, or makes half a turn.
 NEAR = 0.25
@@ -84,8 +84,12 @@ class Exploration:
         self._outermost = plan.bound - spec.footprint_radius
         self.keep_within = self._outermost - MARGIN_M - REACTION_S * float(fastest)
         turning = np.array([c.turns for c in spec.command])
-        self._ways = self._list_ways_back(np.where(turning, TURNING, TURNING_SPEED))
-        self._emergency = self._list_ways_back(np.where(turning, 1.0, TURNING_SPEED))
+        self._returns = self._list_return_commands(
+            np.where(turning, TURNING, TURNING_SPEED)
+        )
+        self._fast_returns = self._list_return_commands(
+            np.where(turning, 1.0, TURNING_SPEED)
+        )
 
     @property
     def done(self) -> bool:
@@ -198,9 +202,7 @@ class Exploration:
         if len(allowed) == 0:
             return None
         familiar = self._visits[self._find_cells(levels[allowed])] / self._visits.mean()
-        nearest = self._measure_way_to_centre(
-            poses[allowed, -1], states[allowed, -1], limit
-        )
+        nearest = self._measure_return(poses[allowed, -1], states[allowed, -1], limit)
         score = familiar + CENTRED * nearest
         best = int(np.argmin(score))
         if not np.isfinite(score[best]):
@@ -216,26 +218,26 @@ class Exploration:
             self._command + fraction[None, :, None] * (levels - self._command)[:, None]
         )
 
-    def _list_ways_back(self, factor: Array) -> Array:
+    def _list_return_commands(self, factor: Array) -> Array:
         """Returns constant commands (E, T, C) for turning back; the fastest makes half a turn."""
         low = np.minimum(factor * self.low, self.rest)
         high = np.maximum(factor * self.high, self.rest)
         ends = [sorted(set(three)) for three in zip(low, self.rest, high, strict=True)]
-        ways = np.array(list(product(*ends)))[:, None]
-        first = round(WAY_S[0] / WAY_STEP_S)
-        last = round(1.0 / WAY_STEP_S)
-        poses, _ = self._predict(np.repeat(ways, first, axis=1), WAY_STEP_S)
+        returns = np.array(list(product(*ends)))[:, None]
+        first = round(RETURN_S[0] / RETURN_STEP_S)
+        last = round(1.0 / RETURN_STEP_S)
+        poses, _ = self._predict(np.repeat(returns, first, axis=1), RETURN_STEP_S)
         heading = np.unwrap(poses[..., 2], axis=1)
         turned = float(np.abs(heading[:, -1] - heading[:, -1 - last]).max())
-        needed = float(np.clip(np.pi / max(turned, 1e-6) + 1.0, *WAY_S))
-        return np.repeat(ways, round(needed / WAY_STEP_S), axis=1)
+        needed = float(np.clip(np.pi / max(turned, 1e-6) + 1.0, *RETURN_S))
+        return np.repeat(returns, round(needed / RETURN_STEP_S), axis=1)
 
-    def _measure_way_to_centre(self, pose: Array, state: Array, limit: float) -> Array:
+    def _measure_return(self, pose: Array, state: Array, limit: float) -> Array:
         """Returns how close to the centre return paths lead, over the radius; inf if none."""
-        count = len(self._ways)
+        count = len(self._returns)
         start = np.repeat(pose, count, 0), np.repeat(state, count, 0)
         poses, _ = self._motion.predict(
-            *start, np.tile(self._ways, (len(pose), 1, 1)), WAY_STEP_S
+            *start, np.tile(self._returns, (len(pose), 1, 1)), RETURN_STEP_S
         )
         away = _compute_distance(poses)
         is_inside = away.max(axis=1) <= limit
@@ -256,11 +258,11 @@ class Exploration:
 
     def _return_to_circle(self, length: int) -> Array:
         """Returns commands (T, C) for the return path that leaves the circle least."""
-        away = _compute_distance(self._predict(self._emergency, WAY_STEP_S)[0])
+        away = _compute_distance(self._predict(self._fast_returns, RETURN_STEP_S)[0])
         outside = np.maximum(away.max(axis=1) - self._outermost, 0.0)
         best = np.lexsort((away.min(axis=1), np.round(outside, 2)))[0]
         return np.asarray(
-            self._interpolate_commands(self._emergency[[best], 0], length)[0]
+            self._interpolate_commands(self._fast_returns[[best], 0], length)[0]
         )
 
 

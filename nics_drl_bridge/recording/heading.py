@@ -31,9 +31,8 @@ UNLIKE_BLOCKS = 2.0
 DRIFTS = 4.0  # standard errors beyond which the slope of a bias counts
 DRIFT_SPAN_S = 20.0  # a drift of the bias shows only if the rests span this time
 LEAST_TURN_RAD = 1.0  # sum of all turns below which a drive does not show a scale
-MIN_SAME_MOTION_CORRELATION = (
-    0.7  # minimum correlation of two sources that measure the same motion
-)
+# minimum correlation of two sources that measure the same motion
+MIN_SAME_MOTION_CORRELATION = 0.7
 # plausible range of odometry's turns, relative to those of the gyro
 PLAUSIBLE_SCALES = (0.33, 5.0)
 IN_DEGREES = (40.0, 80.0)  # ratio of a rate in degrees to one in radians
@@ -221,21 +220,23 @@ def _estimate_bias(blocks: _Blocks) -> GyroBias:
     near = np.abs(rate - usual) <= max(5.0 * scatter, 1e-3)
     rate = rate[near]
     when = when[near]
-    middle = float(when.mean())
-    bias = float(rate.mean())
-    left = rate
-    slope = 0.0
-    if len(rate) >= FEWEST_TO_DRIFT and float(np.ptp(when)) >= DRIFT_SPAN_S:
-        apart = when - middle
-        power = float(apart @ apart)
-        drift = float(apart @ rate) / power
-        drifted = rate - bias - drift * apart
-        drift_std = max(float(drifted.std()), LEAST_BIAS_STD) / np.sqrt(power)
-        if abs(drift) >= DRIFTS * drift_std:
-            slope = drift
-            left = drifted
+    bias, slope = _fit_drift(when, rate)
+    left = rate - bias - slope * (when - when.mean())
     std = max(float(left.std() / np.sqrt(len(rate))), LEAST_BIAS_STD)
-    return GyroBias(bias, std, slope, middle, rest_s)
+    return GyroBias(bias, std, slope, float(when.mean()), rest_s)
+
+
+def _fit_drift(when: Array, rate: Array) -> tuple[float, float]:
+    """Returns the mean rate (n,) at rest, and its slope over time (n,); 0 if none shows."""
+    bias = float(rate.mean())
+    if len(rate) < FEWEST_TO_DRIFT or float(np.ptp(when)) < DRIFT_SPAN_S:
+        return bias, 0.0
+    apart = when - when.mean()
+    power = float(apart @ apart)
+    slope = float(apart @ rate) / power
+    left = rate - bias - slope * apart
+    slope_std = max(float(left.std()), LEAST_BIAS_STD) / np.sqrt(power)
+    return bias, slope if abs(slope) >= DRIFTS * slope_std else 0.0
 
 
 def _estimate_bias_while_driving(blocks: _Blocks) -> GyroBias:

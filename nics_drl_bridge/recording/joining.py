@@ -125,28 +125,15 @@ def _place_parts(
     recordings: Sequence[Recording], learnt: Sequence[_Part], held_out: Sequence[_Part]
 ) -> Recording:
     """Arranges parts on one time axis; each pose begins where the previous one ended."""
-    shared = [*STREAMS]
-    for recording in recordings:
-        shared = [name for name in shared if name in recording.streams]
-    streams: dict[str, list[Stream]] = {name: [] for name in shared}
-    episodes = []
-    start = 0.0
-    place = np.zeros(3)
-    for part in (*learnt, *held_out):
-        shift = start - part.start_s
-        cut = _cut_part(part, shared)
-        first = cut["pose"].values[0]
-        cut["pose"] = _move_pose(cut["pose"], first, place)
-        place = cut["pose"].values[-1]
-        for name, stream in cut.items():
-            streams[name].append(replace(stream, t=stream.t + shift))
-        episodes.append(Episode(part.source, start, part.end_s + shift))
-        start = part.end_s + shift + APART_S
+    shared = [
+        name for name in STREAMS if all(name in drive.streams for drive in recordings)
+    ]
+    parts = (*learnt, *held_out)
+    streams, episodes = _line_up(parts, shared)
     joined: dict[str, Any] = dict.fromkeys(STREAMS)
-    for name, parts in streams.items():
-        joined[name] = _append_streams(name, parts)
-    sources = list(dict.fromkeys(part.source for part in (*learnt, *held_out)))
-    until = episodes[len(learnt) - 1].end_s
+    joined |= {name: _append_streams(name, some) for name, some in streams.items()}
+    sources = list(dict.fromkeys(part.source for part in parts))
+    robots = [drive.robot for drive in recordings if drive.robot is not None]
     return replace(
         recordings[0],
         **joined,
@@ -155,12 +142,30 @@ def _place_parts(
             _describe_join(sources, bool(held_out)),
             *_collect_repairs(recordings, shared),
         ),
-        robot=next(
-            (drive.robot for drive in recordings if drive.robot is not None), None
-        ),
+        robot=next(iter(robots), None),
         episodes=tuple(episodes),
-        learn_until_s=until,
+        learn_until_s=episodes[len(learnt) - 1].end_s,
     )
+
+
+def _line_up(
+    parts: Sequence[_Part], names: Sequence[str]
+) -> tuple[dict[str, list[Stream]], list[Episode]]:
+    """Returns the streams of parts one after another, by name, and the parts as episodes."""
+    streams: dict[str, list[Stream]] = {name: [] for name in names}
+    episodes = []
+    start = 0.0
+    place = np.zeros(3)
+    for part in parts:
+        shift = start - part.start_s
+        cut = _cut_part(part, names)
+        cut["pose"] = _move_pose(cut["pose"], place)
+        place = cut["pose"].values[-1]
+        for name, stream in cut.items():
+            streams[name].append(replace(stream, t=stream.t + shift))
+        episodes.append(Episode(part.source, start, part.end_s + shift))
+        start = part.end_s + shift + APART_S
+    return streams, episodes
 
 
 def _cut_part(part: _Part, names: Sequence[str]) -> dict[str, Stream]:
@@ -196,12 +201,13 @@ def _cut_commands(command: Stream, part: _Part) -> Stream:
     return replace(rows, t=t, values=values, sigma=sigma)
 
 
-def _move_pose(pose: Stream, first: Array, place: Array) -> Stream:
+def _move_pose(pose: Stream, place: Array) -> Stream:
     """Moves poses (T, 3) rigidly so that the first lies at a place (3,).
 
     The robot's motion does not depend on its position. Between two episodes the pose is
     then at rest, regardless of their frames.
     """
+    first = pose.values[0]
     values = geometry.compose(place, geometry.between(first, pose.values))
     if pose.sigma is None:
         return replace(pose, values=values)

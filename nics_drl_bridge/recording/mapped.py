@@ -1,7 +1,6 @@
 """Reads the streams of a recording in any format according to its mapping."""
 
-from collections.abc import Mapping as Names
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -15,8 +14,8 @@ from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.joining import join, split_at
 from nics_drl_bridge.recording.mapping import (
+    DriveMapping,
     ImuSource,
-    Mapping,
     Measured,
     PoseSource,
     Reference,
@@ -53,12 +52,13 @@ MOST_RATIO = 100.0  # maximum ratio of the durations of two streams of a drive
 
 
 def read_mapped(
-    source: Source, mapping: Mapping, spec: RobotSpec | None = None
+    source: Source, mapping: DriveMapping, spec: RobotSpec | None = None
 ) -> Recording:
     """Reads a recording by its mapping. Raises ConfigError or RecordingError if they do not fit.
 
     Only the messages of a `command_topic` need the robot.
     """
+    source.use(mapping)
     if mapping.episode is None:
         return _read_drive(source, mapping, spec)[0]
     plain = mapping.model_copy(update={"episode": None})
@@ -95,7 +95,7 @@ class _Episode(Source):
         return self._table
 
 
-def _is_only_table(reader: MappedReader, mapping: Mapping, table: Table) -> bool:
+def _is_only_table(reader: MappedReader, mapping: DriveMapping, table: Table) -> bool:
     pose = mapping.pose
     values = (*mapping.command.values(), *mapping.state.values())
     used = [reader.locate(value.from_)[0] for value in values]
@@ -104,7 +104,7 @@ def _is_only_table(reader: MappedReader, mapping: Mapping, table: Table) -> bool
 
 
 def _split_table(
-    source: Source, mapping: Mapping, episode: Reference
+    source: Source, mapping: DriveMapping, episode: Reference
 ) -> list[tuple[str, Source]]:
     """Returns label and rows of each episode of a table.
 
@@ -118,12 +118,12 @@ def _split_table(
         return []
     name = next(name for name in source.names if source.get_table(name) is table)
     column = table.column(reference)
-    labels, first, group = np.unique(column, return_index=True, return_inverse=True)
     episodes: list[tuple[str, Source]] = []
+    _, first, group = np.unique(column, return_index=True, return_inverse=True)
     for k in np.argsort(first):
         rows = np.flatnonzero(group == k)
         if len(rows) >= MIN_EPISODE_ROWS:
-            label = _format_label(labels[k])
+            label = _format_label(column[rows[0]])
             place = f"{source.place} (episode {label})"
             episodes.append((label, _Episode(place, name, table, rows)))
     if not episodes:
@@ -135,7 +135,7 @@ def _split_table(
 
 
 def _split_by_time(
-    source: Source, mapping: Mapping, recording: Recording, since: float
+    source: Source, mapping: DriveMapping, recording: Recording, since: float
 ) -> Recording:
     """Splits a recording where its episode column changes.
 
@@ -153,9 +153,10 @@ def _split_by_time(
     stamped = reader.stamp_rows(table, column, None)
     values = column[stamped.rows]
     changes = np.flatnonzero(values[1:] != values[:-1]) + 1
-    starts = [-np.inf, *(float(t) - since for t in stamped.t[changes])]
-    labels = [_format_label(values[k]) for k in (0, *changes)]
-    names = [f"{source.place} (episode {label})" for label in labels]
+    starts = [-np.inf, *(stamped.t[changes] - since)]
+    names = [
+        f"{source.place} (episode {_format_label(values[k])})" for k in (0, *changes)
+    ]
     return split_at(recording, starts, names)
 
 
@@ -164,7 +165,7 @@ def _format_label(value: Any) -> str:
 
 
 def _read_drive(
-    source: Source, mapping: Mapping, spec: RobotSpec | None
+    source: Source, mapping: DriveMapping, spec: RobotSpec | None
 ) -> tuple[Recording, float]:
     """Returns a drive, and the time that was subtracted from the stamps of its pose [s]."""
     reader = MappedReader(source, mapping)
@@ -189,10 +190,9 @@ def _read_drive(
             streams[name] = _read_turn_rate(reader, measured, measured.heading)
         elif measured is not None:
             streams[name] = _read_measured(reader, name, measured)
-    for name, stream in streams.items():
-        is_new, note = stamping.select_new_rows(stream.t, stream.values, name)
-        reader.add_notes(note)
-        streams[name] = stream.rows(is_new)
+    streams = {
+        name: _drop_repeats(reader, name, stream) for name, stream in streams.items()
+    }
     recording = Recording(
         **cast(Any, streams),
         source=source.place,
@@ -207,10 +207,17 @@ def _read_drive(
     return replace(recording, **shifted, repairs=tuple(reader.notes)), origin_s
 
 
+def _drop_repeats(reader: MappedReader, name: str, stream: Stream) -> Stream:
+    """Leaves out rows that repeat the previous one, including its stamp."""
+    is_new, note = stamping.select_new_rows(stream.t, stream.values, name)
+    reader.add_notes(note)
+    return stream.rows(is_new)
+
+
 def _read_values(
     reader: MappedReader,
     name: str,
-    values: Names[str, Value],
+    values: Mapping[str, Value],
     held: bool,
     source: Measured | None = None,
 ) -> Stream:
@@ -222,7 +229,7 @@ def _read_values(
     return combine_series(name, parts, held)
 
 
-def _check_commands(reader: MappedReader, commands: Names[str, Value]) -> None:
+def _check_commands(reader: MappedReader, commands: Mapping[str, Value]) -> None:
     """Refuses a column as a command if its name or values show that it was measured."""
     for name, value in commands.items():
         table, reference = reader.locate(value.from_)
@@ -241,7 +248,7 @@ def _check_commands(reader: MappedReader, commands: Names[str, Value]) -> None:
             raise ConfigError(f"{table.place}: command.{name}: {fault}.")
 
 
-def _guess_pose_source(source: Source, mapping: Mapping) -> MeasuredBy:
+def _guess_pose_source(source: Source, mapping: DriveMapping) -> MeasuredBy:
     """Returns what measured the pose, guessed from names of topic or file, columns and frames."""
     pose = mapping.pose
     values = (pose.x, pose.y, pose.heading)
@@ -363,28 +370,28 @@ def read_pose(
     """Reads poses, with their deviations if a covariance is mapped."""
     if pose.x is None:
         pose = _complete_pose(reader, pose)
-    values = {"x": pose.x, "y": pose.y, "heading": pose.heading}
-    units = {"x": pose.unit, "y": pose.unit, "heading": pose.heading_unit}
     kinds = dict(schema.SI["pose"])
     parts = []
     factors = []
-    for key, value in values.items():
+    for key in schema.SI["pose"]:
+        value: Value | None = getattr(pose, key)
         if value is None:
             parts.append(_read_heading(reader, pose, pose.quaternion or ""))
             factors.append(schema.UNITS[pose.heading_unit].factor)
             continue
-        value = value.model_copy(update={"unit": value.unit or units[key]})
+        usual = pose.heading_unit if key == "heading" else pose.unit
+        value = value.model_copy(update={"unit": value.unit or usual})
         _check_kind(f"pose.{key}", value, kinds[key])
         unit = get_unit(value)
         if key == "x":
             kinds["y"] = (unit.si,)
         parts.append(reader.read_series(f"pose.{key}", value, pose, held=False))
         factors.append(abs(unit.factor * value.scale))
-        if key == "y" and unit.si == "rad":
-            # Longitude and latitude; their covariances are in m.
-            east, north = east_and_north(parts[0].values, parts[1].values)
-            parts = [parts[0]._replace(values=east), parts[1]._replace(values=north)]
-            factors = [1.0, 1.0]
+    if kinds["y"] == ("rad",):
+        # Longitude and latitude; their covariances are in m.
+        east, north = east_and_north(parts[0].values, parts[1].values)
+        parts[:2] = [parts[0]._replace(values=east), parts[1]._replace(values=north)]
+        factors[:2] = [1.0, 1.0]
     _refuse_implausible_pose(reader, combine_series("pose", parts, held=False), spec)
     # A heading can be interpolated only once it is unwrapped.
     parts[2] = parts[2]._replace(values=np.unwrap(parts[2].values))

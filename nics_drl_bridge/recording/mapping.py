@@ -1,4 +1,4 @@
-"""Mapping: which column or message field of a recording is which stream, and in what unit."""
+"""DriveMapping: which column or message field of a recording is which stream, and in what unit."""
 
 import math
 from pathlib import Path
@@ -321,7 +321,7 @@ class OdometrySource(Measured):
     wz: AValue  # turn rate, counter-clockwise [rad/s]
 
 
-class Mapping(Schema):
+class DriveMapping(Schema):
     """How a recording in any format maps to the streams of a Recording."""
 
     # a shipped robot's name, a path, or its definition
@@ -365,7 +365,7 @@ class Mapping(Schema):
         return data
 
     @model_validator(mode="after")
-    def _check_commands(self) -> "Mapping":
+    def _check_commands(self) -> "DriveMapping":
         for name, value in self.command.items():
             why = explain_no_command(str(value.from_))
             if why:
@@ -382,6 +382,6 @@ SI: dict[str, dict[str, tuple[str, ...]]] = {
 """Values of each stream, in order, with their possible SI units."""
 
 
-def load_mapping(path: str | Path) -> Mapping:
+def load_mapping(path: str | Path) -> DriveMapping:
     """Reads a mapping from YAML. Raises ConfigError with file, key and fix."""
-    return load_yaml(path, Mapping)
+    return load_yaml(path, DriveMapping)

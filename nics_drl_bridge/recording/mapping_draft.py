@@ -40,16 +40,6 @@ MOST_LISTED = 20  # maximum number of unused columns listed per table
 STILL = "; it is 0"
 NEEDS_TURN = "; add `ticks_per_turn:`, the counts of a turn of the wheel"
 NO_VALUES = {"header", "stamp", "seq", "covariance", "index", "id", "row"}
-# Check of commands against the motion
-STEP_S = 0.1
-SMOOTHED = 3  # steps over which measured rates are averaged
-LONGEST_LATENCY_S = 3.0  # maximum delay of the motion that is tried
-EARLIEST_S = -1.0  # minimum delay that is tried
-IMPLAUSIBLE_LATENCY_S = 1.0
-PRECEDES_S = -0.3  # a motion this early precedes its command
-LEAST_CORRELATION = 0.3
-CLEAR_CORRELATION = 0.6  # minimum correlation at which a latency is reported
-MIN_STEPS = 100  # steps
 
 
 class MappingDraft(NamedTuple):
@@ -72,60 +62,68 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
     pose = guess_pose(tables)
     guess = guess_command(tables, pose)
     switches = guess_switches(tables) if guess.listed else ()
-    commanded = [command.column for command in guess.listed.values()]
+    used = [command.column for command in guess.listed.values()]
     gyro = guess_yaw_rate(tables)
-    if gyro in commanded:
+    if gyro in used:
         gyro = None
     episode = guess_episode(tables)
-    # The stamps of most tables are those of the whole mapping.
-    times = [table.time for table in tables if table.time is not None]
-    time = max(times, key=times.count, default=None)
-
-    lines = [_write_robot(guess)]
-    if time is not None:
-        lines.append(f"time: {time}  {GUESSED}")
-    elif any(table.t is None and table.rows for table in tables):
-        lines.append(
-            f"time: {{rate: 50}}  {GUESSED}: no stamps were found; rows a second"
-        )
+    time = _choose_time(tables)
+    lines = [_write_robot(guess), *_write_time(tables, time)]
     if episode is not None:
         lines.append(f"episode: {episode.reference}  {GUESSED}")
-    doubts: list[str] = []
+        used.append(episode)
+    poses = None
     if pose is None:
         lines += [NO_POSE, "pose:", "  x: ", "  y: "]
     else:
         units = _name_units(pose)
+        poses = _compute_poses(pose, units)
         lines += _write_pose(pose, units, time)
         lines += _write_clock(pose, guess.listed)
-        doubts += _find_doubts(guess, _compute_poses(pose, units), str(time))
-    if not guess.listed:
-        doubts.append(NO_COMMAND)
     lines += _write_commands(guess, switches, time)
     if gyro is not None:
         lines.append(f"{write_imu_line(gyro, time)}  {GUESSED}")
-    used: list[Field | None] = [*commanded, gyro, episode]
+        used.append(gyro)
     used += [command.column for command in guess.candidates.values()]
     used += [switch.column for switch in switches]
-    return MappingDraft(doubts, lines, [*_list_unused(tables, used, pose)])
+    return MappingDraft(
+        doubts=[*_find_doubts(guess, poses, str(time))],
+        lines=lines,
+        unused=[*_list_unused(tables, used, pose)],
+    )
+
+
+def _choose_time(tables: Sequence[TableSurvey]) -> str | None:
+    """Returns the stamps of most tables, which are those of the whole mapping."""
+    times = [table.time for table in tables if table.time is not None]
+    return max(times, key=times.count, default=None)
+
+
+def _write_time(tables: Sequence[TableSurvey], time: str | None) -> Iterator[str]:
+    """Yields the line for the stamps of most tables, or for rows without stamps."""
+    if time is not None:
+        yield f"time: {time}  {GUESSED}"
+    elif any(table.t is None and table.rows for table in tables):
+        yield f"time: {{rate: 50}}  {GUESSED}: no stamps were found; rows a second"
 
 
 def _find_doubts(
     guess: CommandGuess, poses: tuple[Array, Array] | None, time: str
 ) -> Iterator[str]:
-    """Yields sentences on a pose in the wrong unit, or else on commands without effect.
+    """Yields a sentence on a pose in the wrong unit, and one if no command was recorded.
 
     `time` is the reference to the column of the stamps.
     """
-    if poses is None:
-        return
-    # A car may accelerate harder than a small robot; only the kind distinguishes them.
-    may_be_car = guess.kind is None or guess.kind.startswith("ackermann")
-    fault = find_implausible_pose(*poses, radius=np.inf if may_be_car else USUAL_RADIUS)
-    if fault is None:
-        yield from _compare_with_motion(guess, *poses)
-    else:
-        line = fault.line.replace("...", time)
-        yield f"pose: {fault.reason}; {fault.cause}: add `{line}`"
+    if poses is not None:
+        # A car may accelerate harder than a small robot; only the kind distinguishes them.
+        may_be_car = guess.kind is None or guess.kind.startswith("ackermann")
+        radius = np.inf if may_be_car else USUAL_RADIUS
+        fault = find_implausible_pose(*poses, radius=radius)
+        if fault is not None:
+            line = fault.line.replace("...", time)
+            yield f"pose: {fault.reason}; {fault.cause}: add `{line}`"
+    if not guess.listed:
+        yield NO_COMMAND
 
 
 def _write_robot(guess: CommandGuess) -> str:
@@ -206,7 +204,7 @@ def _write_clock(pose: PoseGuess, commands: Mapping[str, Candidate]) -> Iterator
 
 
 def _list_unused(
-    tables: Sequence[TableSurvey], used: Sequence[Field | None], pose: PoseGuess | None
+    tables: Sequence[TableSurvey], used: Sequence[Field], pose: PoseGuess | None
 ) -> Iterator[str]:
     """Yields a text for each table with the columns of values that the draft does not use."""
     for table in tables:
@@ -288,96 +286,3 @@ def _compute_poses(
     if si == "rad":
         values[:, :2] = np.stack(east_and_north(*values[:, :2].T), axis=1)
     return t[is_finite], values[is_finite]
-
-
-def _compare_with_motion(
-    guess: CommandGuess, stamps: Array, poses: Array
-) -> Iterator[str]:
-    """Yields sentences on commands without effect, or with effects much too early or late.
-
-    `stamps` are those (T,) of `poses` (T, 3) [s].
-    """
-    if guess.of_wheels:
-        return
-    motion = _compute_rates(stamps, poses)
-    if motion is None:
-        return
-    t, speed, turn_rate = motion
-    commands = {command.meaning: command for command in guess.commands.values()}
-    lags = np.arange(EARLIEST_S, LONGEST_LATENCY_S + STEP_S / 2.0, STEP_S)
-    for meaning, signal in (("speed", speed), ("turn", turn_rate)):
-        command = commands.get(meaning)
-        if command is None or signal.std() < 1e-3:
-            continue
-        likeness = _compute_likeness(command, t, signal, lags)
-        if likeness is None:
-            continue
-        name = f"{command.column.table.name}:{command.column.name}"
-        best = int(np.argmax(likeness))
-        yield from _doubt_lag(name, float(likeness[best]), float(lags[best]))
-
-
-def _doubt_lag(name: str, likeness: float, lag: float) -> Iterator[str]:
-    """Yields a sentence if the motion follows a command hardly, or at a strange lag [s]."""
-    if likeness < LEAST_CORRELATION:
-        problem = f"the motion hardly follows {name}"
-        yield f"{problem}; check that it was sent to the robot"
-    elif likeness > CLEAR_CORRELATION and lag > IMPLAUSIBLE_LATENCY_S:
-        problem = f"the motion follows {name} after {lag:.1f} s"
-        yield f"{problem}, which no latency explains; check `time:` and the command"
-    elif likeness > CLEAR_CORRELATION and lag < PRECEDES_S:
-        problem = f"the motion precedes {name} by {-lag:.1f} s"
-        yield f"{problem}, like a measurement; check `time:` and the command"
-
-
-def _compute_rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:
-    """Returns times (K,) [s], speeds (K,) along the heading and turn rates (K,) of a pose."""
-    order = np.argsort(t, kind="stable")
-    t = t[order]
-    pose = pose[order]
-    grid = np.arange(t[0], t[-1], STEP_S)
-    if len(grid) < MIN_STEPS or len(grid) > 10 * len(t) + MIN_STEPS:
-        return None
-    heading = np.unwrap(pose[:, 2])
-    mean = np.ones(SMOOTHED) / SMOOTHED
-    rates = []
-    for column in (pose[:, 0], pose[:, 1], heading):
-        steps = np.diff(np.interp(grid, t, column))
-        rates.append(np.convolve(steps / STEP_S, mean, "same"))
-    vx, vy, turn_rate = rates
-    middle = np.interp(grid[:-1] + STEP_S / 2.0, t, heading)
-    speed = vx * np.cos(middle) + vy * np.sin(middle)
-    sideways = -vx * np.sin(middle) + vy * np.cos(middle)
-    # A tracked body may be mounted across the robot.
-    if np.abs(sideways).sum() > np.abs(speed).sum():
-        speed = sideways
-    return grid[:-1] + STEP_S / 2.0, speed, turn_rate
-
-
-def _compute_likeness(
-    candidate: Candidate, t: Array, signal: Array, lags: Array
-) -> Array | None:
-    """Returns the correlation of a signal (K,) at t (K,) with a command, for each lag (L,) [s]."""
-    column = candidate.column
-    table = column.table
-    values = column.numbers
-    if table.t is None or len(table.t) != len(values) or not column.moves:
-        return None
-    order = np.argsort(table.t, kind="stable")
-    stamps = table.t[order]
-    values = np.nan_to_num(values[order])
-    if stamps[0] > t[-1] or stamps[-1] < t[0]:
-        return None  # they are on another clock
-    likeness = []
-    for lag in lags:
-        row = np.searchsorted(stamps, t - lag, side="right") - 1
-        known = row >= 0
-        command = values[np.clip(row, 0, None)]
-        if known.sum() < MIN_STEPS:
-            return None
-        sent = command[known]
-        measured = signal[known]
-        if sent.std() < 1e-9 or measured.std() < 1e-9:
-            return None
-        likeness.append(abs(float(np.corrcoef(sent, measured)[0, 1])))
-    return np.array(likeness)

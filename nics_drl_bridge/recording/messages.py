@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 Row = tuple[float, float, float]
-LOOSE_QUATERNION_TOLERANCE = (
-    0.1  # maximum difference of a quaternion's squared length from 1
-)
+# maximum difference of a quaternion's squared length from 1
+LOOSE_QUATERNION_TOLERANCE = 0.1
 
 ACKERMANN_DEFINITION = (
     "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"

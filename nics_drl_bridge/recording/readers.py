@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from nics_drl_bridge.arguments import check_path
 from nics_drl_bridge.config import check_no_device, find_config
@@ -12,7 +12,7 @@ from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.bag_file import is_bag, open_bag
 from nics_drl_bridge.recording.bag_table import Bag
 from nics_drl_bridge.recording.mapped import read_mapped
-from nics_drl_bridge.recording.mapping import Mapping, load_mapping
+from nics_drl_bridge.recording.mapping import DriveMapping, load_mapping
 from nics_drl_bridge.recording.recording import (
     Recording,
     check,
@@ -31,7 +31,7 @@ FOLDER = "xtark_folder"  # shipped mapping of a folder that is read without a ma
 # Files that such a folder must have, and may have
 FILES = ("cmd.csv", "vrpn.csv")
 WHEELS = ("L_wheel.csv", "R_wheel.csv")
-AnyMapping = Mapping | TopicRoles | str | Path | None
+AnyMapping = DriveMapping | TopicRoles | str | Path | None
 
 
 def open_drive(
@@ -48,7 +48,7 @@ def open_drive(
     path = Path(source)
     if isinstance(mapping, (str, Path)):
         mapping = load_mapping(mapping)
-    is_mapped = isinstance(mapping, Mapping)
+    is_mapped = isinstance(mapping, DriveMapping)
     if robot is None and not is_mapped and path.exists() and is_bag(path):
         robot = DEFAULT_ROBOT
     drive, known = _read(path, robot, mapping)
@@ -57,7 +57,7 @@ def open_drive(
             "the mapping names no robot; add `robot:` to it, or give --robot."
         )
     spec = _build_with_ranges(known, drive)
-    if isinstance(mapping, Mapping):
+    if isinstance(mapping, DriveMapping):
         _check_units_fit_robot(mapping, spec)
     return spec, reorder_variables(drive, spec)
 
@@ -94,7 +94,7 @@ def read_recording(
     path: str | Path,
     spec: RobotSpec | None = None,
     topics: TopicRoles | None = None,
-    mapping: Mapping | str | Path | None = None,
+    mapping: DriveMapping | str | Path | None = None,
 ) -> Recording:
     """Reads a drive by a mapping or its file, else without one; a bag then needs its robot.
 
@@ -111,7 +111,7 @@ def read_recording(
 
 
 def choose_mapping(
-    topics: TopicRoles | None, mapping: Mapping | str | Path | None
+    topics: TopicRoles | None, mapping: DriveMapping | str | Path | None
 ) -> AnyMapping:
     """Returns the mapping, else the roles of topics. Raises ConfigError if both are given."""
     if mapping is None:
@@ -128,7 +128,7 @@ Robot = RobotSpec | str | dict[str, Any] | None
 
 
 def _read(
-    path: Path, robot: RobotSpec | str | None, mapping: Mapping | TopicRoles | None
+    path: Path, robot: RobotSpec | str | None, mapping: DriveMapping | TopicRoles | None
 ) -> tuple[Recording, Robot]:
     """Returns a drive, and the robot as far as it is known: built, or only its definition."""
     has_bag = path.exists() and is_bag(path)
@@ -139,9 +139,9 @@ def _read(
         )
     if is_recording(path):
         drive = load_recording(path)
-        named = mapping.robot if isinstance(mapping, Mapping) else None
+        named = mapping.robot if isinstance(mapping, DriveMapping) else None
         return drive, robot or named or drive.robot
-    if isinstance(mapping, Mapping):
+    if isinstance(mapping, DriveMapping):
         definition = robot if isinstance(robot, str) else mapping.robot
         known: Robot = robot or definition
         if mapping.command_topic is not None and known is not None:
@@ -154,7 +154,10 @@ def _read(
         if robot is None:
             raise RecordingError(f"{path}: is a bag; give its robot as a RobotSpec.")
         spec = _build(robot)
-        return _read_by_mapping(path, spec, mapping or TopicRoles()), spec
+        with open_bag(path) as opened:
+            bag = Bag(opened)
+            by_roles = write_mapping(mapping or TopicRoles(), bag, spec)
+            return read_mapped(bag, by_roles, spec), spec
     if _holds(path, FILES):
         file = find_config(FOLDER, "recordings")
         mapping = load_mapping(file)
@@ -183,17 +186,10 @@ def _build(robot: RobotSpec | str | dict[str, Any]) -> RobotSpec:
     return robot if isinstance(robot, RobotSpec) else build_robot(robot)
 
 
-def _read_by_mapping(
-    path: Path, robot: Robot, mapping: Mapping | TopicRoles
-) -> Recording:
-    """Reads a drive by a mapping, or a bag by the one that its topics' roles stand for."""
+def _read_by_mapping(path: Path, robot: Robot, mapping: DriveMapping) -> Recording:
     spec = robot if isinstance(robot, RobotSpec) else None
     with open_source(path) as source:
-        if isinstance(source, Bag):
-            if isinstance(mapping, TopicRoles) and spec is not None:
-                mapping = write_mapping(mapping, source, spec)
-            source.use(cast(Mapping, mapping))
-        return read_mapped(source, cast(Mapping, mapping), spec)
+        return read_mapped(source, mapping, spec)
 
 
 def _holds(path: Path, files: tuple[str, ...]) -> bool:
@@ -219,7 +215,7 @@ def explain_no_mapping(path: Path) -> str:
     return f"has topics of known names and types ({used})"
 
 
-def _check_units_fit_robot(mapping: Mapping, spec: RobotSpec) -> None:
+def _check_units_fit_robot(mapping: DriveMapping, spec: RobotSpec) -> None:
     """Refuses commands and states whose units are not of the robot's kind (ConfigError)."""
     for stream, values in (("command", spec.command), ("state", spec.state)):
         for variable in values:

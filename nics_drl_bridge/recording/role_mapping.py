@@ -12,7 +12,13 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.bag_file import Message, read_times
 from nics_drl_bridge.recording.bag_table import Bag, make_message_table
 from nics_drl_bridge.recording.imu_axis import AXES, find_table_axis
-from nics_drl_bridge.recording.mapping import ARRIVAL, HEADER, UNITS, Mapping, Value
+from nics_drl_bridge.recording.mapping import (
+    ARRIVAL,
+    HEADER,
+    UNITS,
+    DriveMapping,
+    Value,
+)
 from nics_drl_bridge.recording.messages import POSITION_UNITS, WHEELS
 from nics_drl_bridge.recording.stamping import TopicData
 from nics_drl_bridge.recording.table import Table, read_numbers
@@ -29,7 +35,7 @@ TWIST = {
 Streams = dict[str, dict[str, dict[str, Any]]]  # values as a mapping writes them
 
 
-def write_mapping(roles: TopicRoles, bag: Bag, spec: RobotSpec) -> Mapping:
+def write_mapping(roles: TopicRoles, bag: Bag, spec: RobotSpec) -> DriveMapping:
     """Returns the mapping of a bag by the roles of its topics, and guesses missing roles.
 
     Raises RecordingError if a role is unclear, or does not fit the robot.
@@ -58,7 +64,7 @@ def write_mapping(roles: TopicRoles, bag: Bag, spec: RobotSpec) -> Mapping:
         }
         if "wheels" in streams:
             mapping["wheels"] = {"in": topic, **streams["wheels"]}
-    return Mapping.model_validate(mapping)
+    return DriveMapping.model_validate(mapping)
 
 
 def _map_imu(bag: Bag, topic: str) -> dict[str, Any]:

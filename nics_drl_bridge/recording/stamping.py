@@ -113,14 +113,15 @@ def stamp_streams(
         clocks = dict.fromkeys(data, (HEADER, origin - first))
     else:
         clocks = _assign_clocks(data, headers, place)
-    robot_clocks = {clocks[name][0] for name in of_robot if name in data}
+    if len({clocks[name][0] for name in of_robot if name in data}) > 1:
+        headers |= dict.fromkeys(of_robot)
     streams = {}
     for name, part in data.items():
         ns = headers[name]
-        clock, shift = clocks[name]
-        if ns is None or (len(robot_clocks) > 1 and name in of_robot):
+        if ns is None:
             streams[name] = _stamp_by_receipt(part, origin)
         else:
+            clock, shift = clocks[name]
             t = np.asarray((ns + shift - origin) * S_PER_NS, dtype=np.float64)
             streams[name] = Stream(t, part.values, clock)
     return streams
@@ -367,9 +368,7 @@ def _join_after_jumps(t: Array, rows: NDArray[np.intp], name: str) -> tuple[Arra
     usual = float(np.median(step[~is_jump]))
     k = int(np.argmax(is_jump))
     first = f"row {rows[k + 1]}, by {abs(step[k]):.3g} s"
-    direction = "ahead"
-    if step[k] < 0.0:
-        direction = "back"
+    direction = "back" if step[k] < 0.0 else "ahead"
     count = format_times(int(is_jump.sum()))
     note = (
         f"{name}: the clock was set {direction} {count} ({first}); the parts were "

@@ -340,22 +340,23 @@ def _describe_regularity(t: Array, numbers: dict[str, Array]) -> Iterator[str]:
     yield f"{1.0 / usual:.4g} Hz, {float(np.ptp(t)):.1f} s"
     gaps = int((step > GAP * usual).sum())
     if gaps:
-        where = float(t[int(np.argmax(step))] - t[0])
-        yield f"gaps: {gaps}, the longest of {step.max():.3g} s after {where:.1f} s"
+        after = f"after {t[np.argmax(step)] - t[0]:.1f} s"
+        yield f"gaps: {gaps}, the longest of {step.max():.3g} s {after}"
     backward = int((step < 0.0).sum())
     if backward:
         yield f"stamps that run backwards: {backward}"
-    whole = [column for column in numbers.values() if len(column) == len(t)]
-    is_same = np.all([c[1:] == c[:-1] for c in whole], axis=0) & (step == 0.0)
     repeated = int((step == 0.0).sum())
     if repeated:
+        whole = [c for c in numbers.values() if len(c) == len(t)]
+        is_same = np.all([c[1:] == c[:-1] for c in whole], axis=0) & (step == 0.0)
         yield (
             f"stamps like the one before: {repeated}, in rows that repeat all of it: "
             f"{is_same.sum()}"
         )
     if (np.abs(step - usual) > IRREGULAR * usual).mean() > IRREGULAR:
         yield "stamps are uneven: rows arrive in bursts"
-    missing = {name: int(np.isnan(column).sum()) for name, column in numbers.items()}
-    for count in sorted({*missing.values()} - {0}):
-        names = ", ".join(name for name in missing if missing[name] == count)
-        yield f"{count} of {len(t)} rows have no {names}"
+    missing: dict[int, list[str]] = {}
+    for name, c in numbers.items():
+        missing.setdefault(int(np.isnan(c).sum()), []).append(name)
+    for count in sorted(missing.keys() - {0}):
+        yield f"{count} of {len(t)} rows have no {', '.join(missing[count])}"

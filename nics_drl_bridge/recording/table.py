@@ -66,6 +66,9 @@ class Source:
         """Delays of scan and odometry, if known."""
         return Latency()
 
+    def use(self, mapping: Any) -> None:
+        """Prepares for reading by a mapping."""
+
     def get_table(self, name: str) -> Table:
         """Returns a table. Raises RecordingError if it is unreadable."""
         if name not in self._read:

@@ -71,12 +71,9 @@ def read_text_table(path: Path) -> Table:
     if head is None and may_be_tum and _is_tum(columns):
         head = list(TUM)
     if head is None:
-        labelled = _split_labels(columns)
-        if labelled:
-            columns, head = labelled
-    columns = [_replace_commas(column) for column in columns]
-    names = tuple([*(head or ()), *[""] * len(columns)][: len(columns)])
-    data = [_convert_column(column) for column in columns]
+        columns, head = _split_labels(columns)
+    names = tuple([*head, *[""] * len(columns)][: len(columns)])
+    data = [_convert_column(_replace_commas(column)) for column in columns]
     return make_table(str(path), names, data, line_numbers, tuple(notes))
 
 
@@ -239,9 +236,9 @@ def _is_tum(columns: Sequence[Sequence[str]]) -> bool:
 
 
 def _split_labels(
-    columns: Sequence[list[str]],
-) -> tuple[list[list[str]], list[str]] | None:
-    """Names columns by labels that are in each row, as in `time: 1.2 ticks: 3 4`."""
+    columns: list[list[str]],
+) -> tuple[list[list[str]], list[str]]:
+    """Names columns by labels that are in each row, as in `time: 1.2 ticks: 3 4`, if any."""
     labelled: dict[str, list[list[str]]] = {}
     label = None
     for column in columns:
@@ -250,7 +247,7 @@ def _split_labels(
             label = first.rstrip(":=")
             labelled[label] = []
         elif label is None:
-            return None
+            return columns, []
         else:
             labelled[label].append(column)
     names = []

@@ -14,7 +14,7 @@ from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import mapping as schema
 from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.mapping import (
-    Mapping,
+    DriveMapping,
     Measured,
     Reference,
     UnitOfData,
@@ -58,7 +58,7 @@ class MappedReader:
     """Reads values of a source, and collects sentences on repairs in `notes`."""
 
     source: Source
-    mapping: Mapping
+    mapping: DriveMapping
 
     def __post_init__(self) -> None:
         self.notes: list[str] = []
@@ -201,18 +201,15 @@ class MappedReader:
         """
         stream = stream or Measured()
         table, column_name = self.locate(value.from_, stream.in_)
-        column = read_numbers(table, column_name)
         time = value.time or stream.time
-        stamped = self.stamp_rows(table, column, time)
-        clocks = (value.clock, stream.clock, self.mapping.clock, stamped.clock)
-        clock = next(filter(None, clocks), schema.ROBOT_CLOCK)
-        raw = column[stamped.rows]
-        infinite = np.flatnonzero(np.isinf(raw))
+        raw = read_numbers(table, column_name)
+        stamped = self.stamp_rows(table, raw, time)
+        raw = raw[stamped.rows]
+        infinite = stamped.rows[np.isinf(raw)]
         if len(infinite) and not allow_infinite:
-            row = table.row(int(stamped.rows[infinite[0]]))
             raise RecordingError(
-                f"{table.place}: {row}: column {column_name!r} is infinite; correct or "
-                "remove the row."
+                f"{table.place}: {table.row(int(infinite[0]))}: column {column_name!r} "
+                "is infinite; correct or remove the row."
             )
         is_finite = np.isfinite(raw)
         if not is_finite.any():
@@ -225,33 +222,39 @@ class MappedReader:
                 f"{name}: {int((~is_finite).sum())} of {len(raw)} rows have no value, "
                 "and were left out."
             )
+        clocks = (value.clock, stream.clock, self.mapping.clock, stamped.clock)
+        clock = next(filter(None, clocks), schema.ROBOT_CLOCK)
         series = Series(stamped.t[is_finite], raw[is_finite], clock)
-        unit = get_unit(value)
-        if value.wrap is not None or value.counts:
-            series = self._unwrap(name, value, series)
-        elif unit.si in ("", "rad/s", "m/s", "ticks/s"):
-            behaviour = stamping.describe_counter(series.values)
-            if behaviour:
-                raise RecordingError(
-                    f"{table.place}: {column_name!r} is a counter that {behaviour}, no "
-                    f"speed: write `{{from: {column_name}, unit: ticks, "
-                    f"ticks_per_turn: ...}}` for {name}."
-                )
-        if value.counts:
-            if stamping.is_oscillating(series.values):
-                raise RecordingError(
-                    f"{self.source.place}: {value.from_!r} goes up and down like a "
-                    "speed, so it is not a counter: write `unit: "
-                    f"{value.unit or 'ticks'}/s` for {name}."
-                )
-            series = _derive_rate(series, held)
-        factor = unit.factor * value.scale
+        series = self._count(name, value, series, held)
+        factor = get_unit(value).factor * value.scale
         if value.maximum is not None:
             factor *= value.maximum
         series = series._replace(values=series.values * factor + value.offset)
         if value.when:
             return self._apply_flags(value, series, table, time)
         return series
+
+    def _count(self, name: str, value: Value, series: Series, held: bool) -> Series:
+        """Returns the rate of a counter; refuses counters and speeds that are confused."""
+        if value.wrap is not None or value.counts:
+            series = self._unwrap(name, value, series)
+        elif get_unit(value).si in ("", "rad/s", "m/s", "ticks/s"):
+            behaviour = stamping.describe_counter(series.values)
+            if behaviour:
+                raise RecordingError(
+                    f"{self.source.place}: {value.from_!r} is a counter that "
+                    f"{behaviour}, no speed: write `{{from: {value.from_}, unit: ticks, "
+                    f"ticks_per_turn: ...}}` for {name}."
+                )
+        if not value.counts:
+            return series
+        if stamping.is_oscillating(series.values):
+            raise RecordingError(
+                f"{self.source.place}: {value.from_!r} goes up and down like a "
+                "speed, so it is not a counter: write `unit: "
+                f"{value.unit or 'ticks'}/s` for {name}."
+            )
+        return _derive_rate(series, held)
 
     def _unwrap(self, name: str, value: Value, series: Series) -> Series:
         """Continues a counter across its overflows; an absolute angle starts near zero."""

@@ -80,23 +80,25 @@ def write_bag(
     """Writes a recording as a bag that `open_drive` reads back; for errors see `open_bag_sink`."""
     # Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`. The pose becomes
     # `/odom`, or `/pose` if it has its own clock or odometry was recorded as well.
+    command = recording.command
     with open_bag_sink(path, storage) as sink:
-        store = sink.store
-        command = recording.command
         for topic, kind, stream, write_content in _list_topics(recording, spec):
             sink.add_topic(topic, kind)
-            stamps = np.round(stream.t * NS_PER_S).astype(np.int64) + START_NS
-            # Streams of other clocks are received from the first command's time on.
-            receive = stamps
+            receive = np.round(stream.t * NS_PER_S).astype(np.int64) + START_NS
+            late_ns = 0
             if stream.clock != command.clock:
-                receive = stamps + round(float(command.t[0] - stream.t[0]) * NS_PER_S)
-                stamps = stamps - APART_NS
-            for k, values in enumerate(stream.values):
-                header = _make_header(int(stamps[k]))
-                content = {"header": header, **write_content(values)}
-                message = _make_message(store, kind, content)
-                data = bytes(store.serialize_cdr(message, kind))
-                sink.write(topic, int(receive[k]), data)
+                # Streams of other clocks are received from the first command's time on.
+                shift_ns = round(float(command.t[0] - stream.t[0]) * NS_PER_S)
+                receive += shift_ns
+                late_ns = shift_ns + APART_NS
+            for receive_ns, values in zip(receive.tolist(), stream.values, strict=True):
+                content = write_content(values)
+                content["header"] = _make_header(receive_ns - late_ns)
+                sink.write(topic, receive_ns, _serialize(sink.store, kind, content))
+
+
+def _serialize(store: "Typestore", kind: str, content: Content) -> bytes:
+    return bytes(store.serialize_cdr(_make_message(store, kind, content), kind))
 
 
 def _make_header(stamp_ns: int) -> dict[str, Any]:

@@ -171,14 +171,14 @@ def _make_failures(
         )
     heads = ("claim", "driver or fault", "world", "near x, y [m]", "failures", "seeds")
     count = f"Failed trials: {len(results['failures']):,}. Clusters: {len(clusters):,}."
-    told = (
+    advice = (
         "Replay one by its seed. An episode is repeated bit for bit and drawn; a "
         "fault is injected again, at another time:"
     )
     return [
         html.make_paragraph(count),
         html.make_table(heads, rows),
-        html.make_paragraph(told),
+        html.make_paragraph(advice),
         html.make_code(_make_command(protocol, folder, clusters[0]["seeds"][0])),
     ]
 

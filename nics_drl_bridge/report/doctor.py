@@ -229,7 +229,7 @@ def check_latency(facts: Facts, _: Expected) -> Findings:
         if -FUTURE_S <= age <= LATE_S:
             continue
         side = "after" if age < 0 else "before"
-        fix = "stamp when it is measured, and look for queues, load and network on the way"
+        fix = "stamp data when they are measured; look for queues, load and a slow network"
         if abs(age) > OFFSET_S or age < 0:
             fix = "synchronise the clocks (NTP, chrony), or set use_sim_time on all nodes or none"
         yield error(
@@ -288,7 +288,8 @@ def check_turning(facts: Facts, expected: Expected) -> Findings:
         return
     if not facts.yaw_rates:
         yield gyro_warning(
-            "says that it measures no yaw rate", "choose another topic by --imu"
+            "reports that it does not measure the yaw rate",
+            "choose another topic by --imu",
         )
         return
     turning = _compare_turns(facts)
@@ -321,14 +322,13 @@ def _compare_turns(facts: Facts) -> Turning | None:
     stamps = facts.heard[ODOM].stamps_ns if ODOM in facts.heard else []
     if not facts.poses or len(stamps) != len(facts.poses):
         return None
-    origin = stamps[0]
-    odom_t, places = np.unique(
-        (np.array(stamps) - origin) * S_PER_NS, return_index=True
-    )
-    poses = np.array(facts.poses)[places]
-    gyro_t = np.array([(stamp - origin) * S_PER_NS for stamp, _ in facts.yaw_rates])
-    gyro_t, rows = np.unique(gyro_t, return_index=True)
-    rates = np.array([rate for _, rate in facts.yaw_rates])[rows]
+    odom_ns, rows = np.unique(stamps, return_index=True)
+    poses = np.array(facts.poses)[rows]
+    gyro_stamps, yaw_rates = zip(*facts.yaw_rates, strict=True)
+    gyro_ns, rows = np.unique(gyro_stamps, return_index=True)
+    rates = np.array(yaw_rates)[rows]
+    odom_t = (odom_ns - stamps[0]) * S_PER_NS
+    gyro_t = (gyro_ns - stamps[0]) * S_PER_NS
     if not (np.isfinite(poses).all() and np.isfinite(rates).all()):
         return None
     for window_s in (WINDOW_S, SHORT_WINDOW_S):
@@ -378,12 +378,12 @@ def _check_moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> F
     jumps = going & (far > JUMP_M) & (far > JUMP * fastest * dt)
     if jumps.sum() > 0.2 * going.sum():
         speed = float(np.median((far[going] / dt[going])[jumps[going]]))
-        what = f"positions change by {speed:.0f} a second, the robot reaches {fastest:.2g} m/s"
-        yield odometry_error(what, "give positions in metres, not millimetres")
+        what = f"positions change by {speed:.0f} per second, but it reaches {fastest:.2g} m/s"
+        yield odometry_error(what, "publish positions in metres, not millimetres")
         return
     if jumps.any():
         what = f"jumps {jumps.sum()} times, by up to {far[jumps].max():.2f} m"
-        fix = "odom must be continuous (REP-105): corrections belong into map -> odom"
+        fix = "odom must be continuous (REP-105): corrections belong in map -> odom"
         yield odometry_error(what, fix)
     keep = going & ~jumps
     turn = np.asarray(wrap_angle(np.diff(poses[:, 2])))
@@ -425,13 +425,13 @@ def _compare_rates(
     for factor, name in units:
         if _is_alike(ratio / factor):
             what = f"{what}: {name}"
-            fix = f"give the twist in {good}"
+            fix = f"publish the twist in {good}"
             break
         if _is_alike(ratio * factor):
             what = (
                 f"the pose changes {1 / ratio:.3g} times as fast as twist.{field} says"
             )
-            fix = "give the pose in metres and radians"
+            fix = "publish the pose in metres and radians"
             break
     yield odometry_error(what, fix)
 
@@ -548,7 +548,7 @@ def check_ranges(facts: Facts, expected: Expected) -> Findings:
             fraction = f"{100 * hit.mean():.0f} % of the ranges are {word}"
             fix = f"set `no_return: {word}` in the lidar and generate the model again"
             yield convention(
-                f"{fraction}, but no return is expected as {spec.no_return}", fix
+                f"{fraction}, but the model expects {spec.no_return} for no return", fix
             )
     if np.isfinite(values[values < 0.0]).any():
         fix = (

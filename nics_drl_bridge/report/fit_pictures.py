@@ -45,6 +45,7 @@ LEAST_ERROR = 1e-12
 LEAST_RATE = 1e-6
 MOST_POINTS = 3000
 CURVE_POINTS = 400  # number of points at which an input curve is drawn
+BAND: dict[str, Any] = {"color": DARK, "markersize": 14, "label": "95 % within"}
 CAPTIONS = {
     "accuracy": "Error against the number of terms; circles mark how many are kept.",
     "residuals": "Rates on unseen data, those of the model, and the residuals.",
@@ -159,21 +160,16 @@ def draw_yardsticks(identified: Identified) -> bytes:
         ("textbook", "fitted textbook", MEASURED, "s--"),
         ("kept_twist", "constant twist", OTHER, "^:"),
     ):
-        points = [(at.horizon_s, getattr(at, name)) for at in judgement]
-        points = [(horizon_s, error) for horizon_s, error in points if error]
-        horizons_s = [horizon_s for horizon_s, _ in points]
-        errors = [max(error.position_m, LEAST_ERROR) for _, error in points]
+        points = [
+            (at.horizon_s, max(getattr(at, name).position_m, LEAST_ERROR))
+            for at in judgement
+            if getattr(at, name)
+        ]
         if points:
-            axes.plot(horizons_s, errors, line, color=colour, label=label)
+            axes.plot(*zip(*points, strict=True), line, color=colour, label=label)
     band = [(at.horizon_s, at.band_m) for at in judgement if at.band_m]
     if band:
-        axes.plot(
-            *zip(*band, strict=True),
-            "_",
-            color=DARK,
-            markersize=14,
-            label="95 % within",
-        )
+        axes.plot(*zip(*band, strict=True), "_", **BAND)
     axes.set(
         xscale="log", yscale="log", xlabel="horizon [s]", ylabel="error of position [m]"
     )
@@ -321,9 +317,9 @@ def _draw_restraint(axes: Axes, identified: Identified, dof: str) -> None:
     every = max(1, len(samples.t) // MOST_POINTS)
     x = samples.x[::every]
     measured = samples.dq[::every, d]
-    asked = taylor.evaluate(x, model.powers) @ model.coefficients[d]
-    axes.plot(asked, measured, color=MEASURED, label="measured", **POINTS)
-    axes.plot(asked, model.rates(x)[:, d], color=MODEL, label="model", **POINTS)
+    unlimited = taylor.evaluate(x, model.powers) @ model.coefficients[d]
+    axes.plot(unlimited, measured, color=MEASURED, label="measured", **POINTS)
+    axes.plot(unlimited, model.rates(x)[:, d], color=MODEL, label="model", **POINTS)
     for word, edge in zip(("fall", "rise"), model.limits[d - 3].tolist(), strict=True):
         sigma = identified.calibration.uncertainty.get(
             f"{model.variables[d - 3]}.{word}", 0.0

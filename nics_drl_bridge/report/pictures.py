@@ -250,12 +250,27 @@ def draw_seeded_world(
     sampler = SceneSampler(world, footprint)
     scene = sampler.draw([seed])[0]
     low, high = np.array(world.extent).reshape(2, 2)
-    size = high - low
     view = make_view(low, high, WORLD_SIDE)
     figure, (axes,) = make_panels(1, 1)
     draw_world(axes, world, scene.bodies)
     _draw_regions(axes, world)
     _draw_movers(axes, sampler.motions[0], scene)
+    _draw_start_and_goal(axes, scene, footprint, outline)
+    view.show(axes)
+    width, height = high - low
+    count = np.count_nonzero(scene.bodies[:, RADIUS])
+    about = f"{width:.3g} m x {height:.3g} m, {count} obstacles, seed {seed}"
+    axes.set_title(f"{world.name}: {about}")
+    return render_png(figure, axes, view.panel)
+
+
+def _draw_start_and_goal(
+    axes: Axes,
+    scene: Scene,
+    footprint: float,
+    outline: Sequence[tuple[float, float]] | None,
+) -> None:
+    """Draws the robot at its start, and its goal."""
     look: dict[str, Any] = {
         "facecolor": MEASURED,
         "edgecolor": DARK,
@@ -265,11 +280,6 @@ def draw_seeded_world(
     look_of_goal: dict[str, Any] = {"marker": "*", "color": GOAL, "edgecolor": DARK}
     x, y = scene.goals[0]
     axes.scatter(x, y, s=320, zorder=5, label="goal", **look_of_goal)
-    view.show(axes)
-    count = np.count_nonzero(scene.bodies[:, RADIUS])
-    about = f"{size[0]:.3g} m x {size[1]:.3g} m, {count} obstacles, seed {seed}"
-    axes.set_title(f"{world.name}: {about}")
-    return render_png(figure, axes, view.panel)
 
 
 def _draw_movers(axes: Axes, motions: Sequence[Motion | None], scene: Scene) -> None:
@@ -289,6 +299,6 @@ def _draw_movers(axes: Axes, motions: Sequence[Motion | None], scene: Scene) -> 
         motion for motion in dict.fromkeys(motions) if isinstance(motion, Patrol)
     ]
     for number, patrol in enumerate(patrols):
-        way = np.array([*patrol.waypoints, *patrol.waypoints[: int(patrol.loop)]])
-        label = None if number else "its way"
-        axes.plot(*way.T, color=MODEL, linewidth=1.2, linestyle=":", label=label)
+        path = np.array([*patrol.waypoints, *patrol.waypoints[: int(patrol.loop)]])
+        label = None if number else "its path"
+        axes.plot(*path.T, color=MODEL, linewidth=1.2, linestyle=":", label=label)

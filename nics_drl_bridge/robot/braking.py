@@ -91,9 +91,8 @@ class TurnBraking:
     """
 
     reaction_s: float  # until the turn starts to brake, lags included
-    deceleration: (
-        float  # how fast the turn slows after that; inf for lags alone [rad/s^2]
-    )
+    # how fast the turn slows after that; inf for lags alone [rad/s^2]
+    deceleration: float
     least_turn: float = 1.0  # minimum fraction of this bound that the robot turns
     least_path: float = 1.0  # minimum fraction of its path's bound that the robot moves
 
@@ -111,9 +110,8 @@ class Braking:
     """
 
     reaction_s: float  # from the command to stop until braking counts, lags included
-    deceleration: (
-        float  # how fast the robot slows after that; inf for lags alone [m/s^2]
-    )
+    # how fast the robot slows after that; inf for lags alone [m/s^2]
+    deceleration: float
     # Factor of the turn rate in the pace [m]; wheels that also turn the robot brake both motions
     lever_m: float = 0.0
     drift: Drift = NO_DRIFT  # off its arc while it brakes
@@ -158,6 +156,16 @@ class Stops(NamedTuple):
     travel: Array  # (K, 3) path of each component: |vx|, |vy| [m], |wz| [rad]
     last_twist: Array  # (K, 3) at the end of the simulation
     holds_angle: NDArray[np.bool_]  # (K,) True where steering angles were held
+
+    def extend(self, twist: Array, creep: Array, dt: float) -> "Stops":
+        """Returns the stops after another step of dt [s], without the twist (K, 3) of creeping."""
+        speed = np.hypot(twist[:, 0], twist[:, 1])
+        creep_speed = np.hypot(creep[:, 0], creep[:, 1])
+        return self._replace(
+            path=self.path + np.maximum(speed - creep_speed, 0.0) * dt,
+            travel=self.travel + np.maximum(np.abs(twist) - np.abs(creep), 0.0) * dt,
+            last_twist=twist,
+        )
 
 
 def find_braking(
@@ -310,7 +318,7 @@ def simulate_stops(
     with np.errstate(over="ignore", invalid="ignore"):
         state = _find_steady_states(robot, model, commands)
         rest = np.clip(0.0, robot.command_low, robot.command_high)
-        is_angle = np.array([command.unit == "rad" for command in robot.command])
+        is_angle = _select_angles(robot)
         held = np.where(is_angle, commands, rest)
         stops = [_simulate_stop(robot, model, state, commands, held, ramp)]
         if is_angle.any():
@@ -378,40 +386,41 @@ def _simulate_stop(
 ) -> Stops:
     """Simulates stops: each command goes to rest (K, C) by its ramp, after its delay."""
     dt = model.dt
-    delays = model.delays
     gap = rest - commands
-    low, high = model.state_box
     # A bias of its fit may make a model creep at rest.
     rest_state = _find_steady_states(robot, model, rest)
     creep = model.rates(_join_inputs(model, rest_state, rest))[:, :3]
-    creep_speed = np.hypot(creep[:, 0], creep[:, 1])
-    first_twist = model.rates(_join_inputs(model, state, commands))[:, :3]
-    twist = first_twist
-    path = np.zeros(len(commands))
-    travel = np.zeros((len(commands), 3))
-    for step in range(round((MAX_STOP_S + delays.max(initial=0.0)) / dt)):
-        passed = (step + 0.5) * dt - delays  # in the middle of this step
-        change = np.where(passed > 0.0, ramp * np.maximum(passed, dt / 2.0), 0.0)
+    twist = model.rates(_join_inputs(model, state, commands))[:, :3]
+    held = (gap == 0.0) & _select_angles(robot) & (commands != 0.0)
+    stops = Stops(
+        twist=twist,
+        path=np.zeros(len(commands)),
+        travel=np.zeros((len(commands), 3)),
+        last_twist=twist,
+        holds_angle=held.any(axis=1),
+    )
+    for step in range(round((MAX_STOP_S + model.delays.max(initial=0.0)) / dt)):
+        change = _compute_change(ramp, model.delays, step, dt)
         moved = np.sign(gap) * np.minimum(np.abs(gap), change)
         rates = model.rates(_join_inputs(model, state, commands + moved))
-        twist = rates[:, :3]
-        speed = np.hypot(twist[:, 0], twist[:, 1])
-        path += np.maximum(speed - creep_speed, 0.0) * dt
-        travel += np.maximum(np.abs(twist) - np.abs(creep), 0.0) * dt
-        after = np.clip(state + rates[:, 3:] * dt, low, high)
+        stops = stops.extend(rates[:, :3], creep, dt)
+        after = np.clip(state + rates[:, 3:] * dt, *model.state_box)
         settled = _is_settled(state, after) and bool((moved == gap).all())
         state = after
         if settled:
             break
-    is_angle = np.array([command.unit == "rad" for command in robot.command])
-    holds_angle = ((rest == commands) & is_angle & (commands != 0.0)).any(axis=1)
-    return Stops(
-        twist=first_twist,
-        path=path,
-        travel=travel,
-        last_twist=twist,
-        holds_angle=holds_angle,
-    )
+    return stops
+
+
+def _select_angles(robot: RobotSpec) -> NDArray[np.bool_]:
+    """Selects the commands (C,) that are steering angles."""
+    return np.array([command.unit == "rad" for command in robot.command])
+
+
+def _compute_change(ramp: Array, delays: Array, step: int, dt: float) -> Array:
+    """Returns how far commands (C,) may have changed in the middle of a step of dt [s]."""
+    passed = (step + 0.5) * dt - delays
+    return np.where(passed > 0.0, ramp * np.maximum(passed, dt / 2.0), 0.0)
 
 
 def _require_rest(robot: RobotSpec, stops: Stops) -> None:

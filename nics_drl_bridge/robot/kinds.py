@@ -413,15 +413,15 @@ def make_wheeled(
             "correct `state:`.",
         )
     dofs = [POSE_RATES.index(dof) for dof in moves]
-    fields = tuple(specs.CMD_VEL_FIELDS[dof] for dof in dofs)
+    wheels_from_command = inverse
+    command_from_twist = np.eye(len(dofs))
+    names: tuple[str, ...] = ()
     if all(c.unit == "rad/s" and c.cmd_vel is None for c in spec.command):
         wheels_from_command = np.eye(len(inverse))
         command_from_twist = inverse
-        columns = _find_columns(spec, fields, wheels, len(inverse))
-    else:
-        wheels_from_command = inverse
-        command_from_twist = np.eye(len(dofs))
-        columns = _find_columns(spec, fields, (), len(dofs))
+        names = wheels
+    fields = tuple(specs.CMD_VEL_FIELDS[dof] for dof in dofs)
+    columns = _find_columns(spec, fields, names, len(command_from_twist))
     slip_factors = np.array([1.0, 1.0, slip])
     twist_from_wheels = forward * slip_factors[:, None]
     if _has_actuator_state(spec):

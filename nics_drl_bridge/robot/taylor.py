@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain, combinations_with_replacement
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -245,15 +245,11 @@ class TaylorModel:
             terms[dof] = {names[k]: float(row[k]) for k in np.flatnonzero(row)}
         box = zip(self.low.tolist(), self.high.tolist(), strict=True)
         states = self.variables[: self.state_size]
-        commands = self.variables[self.state_size :]
-        emf = {}
-        limited = {}
-        for s, state in enumerate(states):
-            brakes = _name_positive(commands, self.back_emf[s])
-            if brakes:
-                emf[state] = brakes
-            if np.isfinite(self.limits[s]).any():
-                limited[state] = tuple(self.limits[s].tolist())
+        limited = zip(states, self.limits.tolist(), strict=True)
+        brakes = [
+            _name_positive(self.variables[self.state_size :], row)
+            for row in self.back_emf
+        ]
         return NamedTaylorModel.model_construct(
             dt=self.dt,
             units=dict(zip(self.dofs, self.dof_units, strict=True)),
@@ -266,8 +262,10 @@ class TaylorModel:
             inputs=self.inputs,
             friction=_name_positive(states, self.friction) or None,
             drag=_name_positive(states, self.drag) or None,
-            limits=limited or None,
-            back_emf=emf or None,
+            limits={s: tuple(row) for s, row in limited if np.isfinite(row).any()}
+            or None,
+            back_emf={s: row for s, row in zip(states, brakes, strict=True) if row}
+            or None,
         )
 
 
@@ -372,9 +370,8 @@ class Quality:
     condition: dict[str, float]  # condition number of the standardised kept features
     rmse: dict[str, float]  # error of each rate on the training data
     r2: dict[str, float]
-    held_out_rmse: dict[
-        str, float
-    ]  # the same on held-out data; empty if there are none
+    # the same on held-out data; empty if there are none
+    held_out_rmse: dict[str, float]
     held_out_r2: dict[str, float]
     # Open-loop predictions on held-out data: mean errors at their ends, mean path; 0 without data
     open_loop_horizon_s: float = 0.0
@@ -409,42 +406,23 @@ class NamedTaylorModel(Schema):
     def model(self) -> TaylorModel:
         """Returns the model as arrays. Raises ModelError if its names are inconsistent."""
         variables = tuple(self.valid)
-        dofs = tuple(self.terms)
-        try:
-            units = tuple(self.units[dof] for dof in dofs)
-            parsed = {}
-            for name in chain.from_iterable(self.terms.values()):
-                parsed[name] = parse_term(name, variables)
-        except KeyError as error:
-            raise ModelError(
-                f"kinematics: {error} has no unit; generate the model again."
-            ) from None
-        except (OverflowError, ValueError) as error:
-            raise ModelError(
-                f"kinematics: {error}; generate the model again."
-            ) from None
-        names = sorted(parsed, key=lambda name: make_sort_key(parsed[name]))
-        powers = np.array([parsed[name] for name in names], dtype=np.int64)
-        rows = []
-        for dof in dofs:
-            rows.append([self.terms[dof].get(name, 0.0) for name in names])
-        box = np.array(list(self.valid.values())).reshape(len(variables), 2)
-        states = variables[: len(dofs) - 3]
-        friction = self.friction or {}
-        drag = self.drag or {}
-        limits = self.limits or {}
+        states = variables[: len(self.terms) - 3]
         commands = variables[len(states) :]
-        emf = []
-        for state in states:
-            brakes = (self.back_emf or {}).get(state, {})
-            emf.append([brakes.get(command, 0.0) for command in commands])
         self._check_stages(states, commands)
+        powers = self._parse_terms(variables)
+        rows = [
+            _list_values(terms, tuple(powers), 0.0) for terms in self.terms.values()
+        ]
+        box = np.array(list(self.valid.values())).reshape(len(variables), 2)
+        brakes = self.back_emf or {}
         return TaylorModel(
             variables,
-            dofs,
-            units,
-            powers.reshape(len(names), len(variables)),
-            np.array(rows, dtype=np.float64).reshape(len(dofs), len(names)),
+            tuple(self.terms),
+            tuple(self.units[dof] for dof in self.terms),
+            np.array(list(powers.values()), np.int64).reshape(
+                len(powers), len(variables)
+            ),
+            np.array(rows).reshape(len(self.terms), len(powers)),
             self.dt,
             box[:, 0],
             box[:, 1],
@@ -452,13 +430,33 @@ class NamedTaylorModel(Schema):
             quality=self.quality,
             bounded=self.bounded,
             inputs=self.inputs,
-            friction=np.array([friction.get(name, 0.0) for name in states]),
-            drag=np.array([drag.get(name, 0.0) for name in states]),
-            limits=np.array([limits.get(name, (-np.inf, np.inf)) for name in states]),
-            back_emf=np.array(emf),
+            friction=_list_values(self.friction, states, 0.0),
+            drag=_list_values(self.drag, states, 0.0),
+            limits=_list_values(self.limits, states, (-np.inf, np.inf)),
+            back_emf=np.array(
+                [_list_values(brakes.get(state), commands, 0.0) for state in states]
+            ),
         ).add_errors(self.standard_errors or {})
 
+    def _parse_terms(self, variables: tuple[str, ...]) -> dict[str, NDArray[np.int64]]:
+        """Returns the exponents (V,) of each term, in the order of `list_exponents`."""
+        try:
+            parsed = {
+                name: parse_term(name, variables)
+                for name in chain.from_iterable(self.terms.values())
+            }
+        except (OverflowError, ValueError) as error:
+            raise ModelError(
+                f"kinematics: {error}; generate the model again."
+            ) from None
+        return dict(sorted(parsed.items(), key=lambda item: make_sort_key(item[1])))
+
     def _check_stages(self, states: tuple[str, ...], commands: tuple[str, ...]) -> None:
+        for dof in self.terms:
+            if dof not in self.units:
+                raise ModelError(
+                    f"kinematics: {dof!r} has no unit; generate the model again."
+                )
         curved = [curve.command for curve in self.inputs]
         _check_names("inputs", curved, commands)
         for key in ("friction", "drag", "limits", "back_emf"):
@@ -467,6 +465,14 @@ class NamedTaylorModel(Schema):
             _check_names("back_emf", row, commands)
         if len(set(curved)) < len(curved):
             raise ModelError("kinematics: key 'inputs' has a command twice; keep one.")
+
+
+def _list_values(
+    by_name: Mapping[str, Any] | None, names: tuple[str, ...], default: Any
+) -> Array:
+    """Returns values in the order of names."""
+    given = by_name or {}
+    return np.array([given.get(name, default) for name in names], dtype=np.float64)
 
 
 def _check_names(key: str, names: Iterable[str], allowed: tuple[str, ...]) -> None:

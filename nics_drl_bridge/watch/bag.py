@@ -44,7 +44,7 @@ class BagSource:
         self._times, self._shots, lidar = _read(path, model, topics)
         self._model = replace(model, lidar=lidar)
         self._path = Path(path)
-        self._world = world or place_of(self._model, self._shots)
+        self._world = world or make_world(self._model, self._shots)
         if len(self._times) > 1:
             self.period_s = float(np.median(np.diff(self._times)))
         else:
@@ -68,11 +68,11 @@ class BagSource:
         """See `show.FrameSource`."""
         poses = np.array([shot.poses for shot in self._shots[: self._now + 1]])
         step = -(-len(poses) // Track.MOST)
-        ways = tuple(
+        paths = tuple(
             np.concatenate([poses[::step], poses[-1:]])[:, :, :2].transpose(1, 0, 2)
         )
         state = "the end" if self._now == len(self._shots) - 1 else ""
-        world = WorldFrame(self._shots[self._now], self._path.name, 0, ways, state)
+        world = WorldFrame(self._shots[self._now], self._path.name, 0, paths, state)
         return Frame(float(self._times[self._now]), (world,))
 
     def advance(self) -> bool:
@@ -107,10 +107,10 @@ def _read(
     frame_role = SCAN if SCAN in messages else ODOM
     command: Array | None = None
     for role, message in merge_messages(messages):
-        is_used = playback.take(role, message)
         if role == CMD_VEL:
             command = read_robot_command(message.content, model.robot)
-        if role != frame_role or not is_used or ODOM not in middleware.cache.newest:
+        shows = playback.take(role, message) and role == frame_role
+        if not shows or ODOM not in middleware.cache.newest:
             continue
         stamps.append(middleware.newest_ns or 0)
         view = middleware.view(stamps[-1])
@@ -127,12 +127,13 @@ def _read(
             )
         )
     if not shots:
-        reason = "none of its odometry and scans could be used"
-        raise RecordingError(f"{path}: {reason}; see nics bag info.")
+        raise RecordingError(
+            f"{path}: none of its odometry and scans could be used; see nics bag info."
+        )
     return [(stamp - stamps[0]) * S_PER_NS for stamp in stamps], shots, playback.lidar
 
 
-def place_of(model: SimulatorModel, shots: list[Snapshot]) -> World:
+def make_world(model: SimulatorModel, shots: list[Snapshot]) -> World:
     """Returns a field without walls that contains the path and most of the lidar's hits."""
     poses = np.concatenate([shot.poses[:, :2] for shot in shots])
     samples = shots[:: max(1, len(shots) // 50)]

@@ -164,7 +164,7 @@ class Lane:
         """Continues from here in a new env, with another policy or other obstacles."""
         shot = self.env.snapshot()
         kept = dict(vars(self))
-        world = standing(self.env, *more, emptied=emptied)
+        world = copy_world(self.env, *more, emptied=emptied)
         try:
             self._open(policy, world)
             self.begin(start=shot.poses[0], goal=shot.goals[0])
@@ -178,7 +178,7 @@ class Lane:
         shot = self.env.snapshot()
         name = f"{self.world.name}, episode {self.seed}"
         return WorldFrame(
-            shot, name, place + shot.member, self.trail.ways, self.state, self.time_s
+            shot, name, place + shot.member, self.trail.paths, self.state, self.time_s
         )
 
     def close(self) -> None:
@@ -186,7 +186,7 @@ class Lane:
         self._env.close()
 
 
-def standing(env: BridgeEnv, *more: Obstacles, emptied: bool = False) -> World:
+def copy_world(env: BridgeEnv, *more: Obstacles, emptied: bool = False) -> World:
     """Returns an env's world with `more` obstacles, and its current ones unless `emptied`."""
     shot = env.snapshot()
     world = env.world.members[shot.member]

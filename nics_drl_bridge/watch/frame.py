@@ -207,6 +207,6 @@ class Track:
             del self._points[::2]
 
     @property
-    def ways(self) -> tuple[Array, ...]:
+    def paths(self) -> tuple[Array, ...]:
         """Paths (T, 2) of the robots."""
         return tuple(np.array(self._points).transpose(1, 0, 2)) if self._points else ()

@@ -27,7 +27,7 @@ class HumanView:
         """Shows a shot, and returns once the next one is due."""
         self._trail.add(shot.poses, shot.step)
         self._frames += 1
-        worlds = (WorldFrame(shot, place=shot.member, trails=self._trail.ways),)
+        worlds = (WorldFrame(shot, place=shot.member, trails=self._trail.paths),)
         frame = Frame(self._frames * self._period_s, worlds)
 
         def show(_: object = None) -> None:

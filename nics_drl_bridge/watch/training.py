@@ -64,6 +64,6 @@ class TrainingView:
             name = f"{env.world.name} {n}"
             time_s = shot.step * env.model.control_period
             place = first + shot.member
-            worlds.append(WorldFrame(shot, name, place, trail.ways, time_s=time_s))
+            worlds.append(WorldFrame(shot, name, place, trail.paths, time_s=time_s))
         period_s = self._worlds[0][0].model.control_period
         return Frame(self._steps * period_s, tuple(worlds), self.note)

@@ -11,7 +11,7 @@ from command_line import nics
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.generator import load_model
 from nics_drl_bridge.recording import textbook
-from nics_drl_bridge.recording.mapping import UNITS, Mapping
+from nics_drl_bridge.recording.mapping import UNITS, DriveMapping
 from nics_drl_bridge.recording.recording import load_recording
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -77,7 +77,7 @@ def test_a_log_with_its_mapping_becomes_a_simulator(folder, tmp_path):
 def test_the_mapping_and_the_units_of_the_docs_are_those_of_the_code():
     text = DOCS.read_text()
     example = re.search(r"```yaml\n(.*?)```", text, re.DOTALL)
-    Mapping.model_validate(parse_yaml(example.group(1), "docs"))
+    DriveMapping.model_validate(parse_yaml(example.group(1), "docs"))
     row = next(line for line in text.splitlines() if line.startswith("| `unit`"))
     listed = [
         unit for some in re.findall("`([^`]+)`", row)[1:] for unit in some.split()

@@ -16,7 +16,7 @@ from nics_drl_bridge.identify.judgement import (
     select_usual_horizon,
 )
 from nics_drl_bridge.identify.report import conclude
-from nics_drl_bridge.recording.mapping import Mapping
+from nics_drl_bridge.recording.mapping import DriveMapping
 from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.readers import open_drive, open_source
 from nics_drl_bridge.recording.survey import inspect_tables
@@ -27,7 +27,7 @@ def identify_by_draft(path: Path) -> Identified:
     """Fits a model to a recording, mapped by its draft as it is."""
     with open_source(path) as source:
         text = propose_mapping(inspect_tables(source)).text
-    mapping = Mapping.model_validate(parse_yaml(text, "draft"))
+    mapping = DriveMapping.model_validate(parse_yaml(text, "draft"))
     spec, recording = open_drive(path, None, mapping)
     return identify(recording, spec, order="auto", alpha="auto")
 

@@ -1,4 +1,4 @@
-"""Tables for tests: a drive as columns, written as users have them, and read by a mapping."""
+"""Tables for tests: a drive as columns, written as users have them, drafted and read."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from nics_drl_bridge.config import parse_yaml
-from nics_drl_bridge.recording.mapping import Mapping
-from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.mapping import DriveMapping
+from nics_drl_bridge.recording.mapping_draft import propose_mapping
+from nics_drl_bridge.recording.readers import open_source, read_recording
 from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.recording.survey import inspect_tables
 
 MAP: dict[str, Any] = {
     "time": "t",
@@ -51,7 +53,21 @@ def read(path: Path, changes: str = "") -> Recording:
     return read_recording(path, mapping=change_map(changes))
 
 
-def change_map(changes: str) -> Mapping:
+def change_map(changes: str) -> DriveMapping:
     """Returns `MAP` with other keys, in YAML; null removes one."""
     given = MAP | (parse_yaml(changes, "changes") if changes else {})
-    return Mapping.model_validate({k: v for k, v in given.items() if v is not None})
+    return DriveMapping.model_validate(
+        {k: v for k, v in given.items() if v is not None}
+    )
+
+
+def draft(path: Path) -> tuple[str, dict[str, Any]]:
+    """Returns the draft of a recording's mapping: its text, and the same as data."""
+    with open_source(path) as source:
+        text = propose_mapping(inspect_tables(source)).text
+    return text, parse_yaml(text, "draft")
+
+
+def read_draft(path: Path, drafted: dict[str, Any]) -> Recording:
+    """Reads a recording by a draft."""
+    return read_recording(path, mapping=DriveMapping.model_validate(drafted))

@@ -91,13 +91,13 @@ def test_a_compressed_bag_gives_the_same_drive(tmp_path, storage, compression):
     plain = bags.write(tmp_path / "plain", bags.drive(), storage)
     small = bags.write(tmp_path / "small", bags.drive(), storage, compression)
     assert storage_file(small).stat().st_size != storage_file(plain).stat().st_size
-    assert same(read_recording(plain, CAR), read_recording(small, CAR))
-    assert same(read_recording(plain, CAR), read_recording(storage_file(small), CAR))
+    whole = read_recording(plain, CAR)
+    for path in (small, storage_file(small)):
+        assert same(whole, read_recording(path, CAR))
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-def test_a_compressed_file_without_its_folder_is_refused(tmp_path, storage):
-    bag = bags.write(tmp_path / "bag", bags.drive(), storage, "file")
+def test_a_compressed_file_without_its_folder_is_refused(tmp_path):
+    bag = bags.write(tmp_path / "bag", bags.drive(), "sqlite3", "file")
     (bag / "metadata.yaml").unlink()
     assert "unpack it with `zstd -d`" in refused(storage_file(bag))
 
@@ -118,8 +118,9 @@ def test_a_bag_in_several_files_is_read_whole(tmp_path):
     assert "contains 2 bag files but no metadata.yaml" in refused(bag)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
-@pytest.mark.parametrize("alone", [False, True])
+@pytest.mark.parametrize(
+    ("share", "alone"), [(0.0, False), (0.3, True), (0.99, False), (0.99, True)]
+)
 def test_a_cut_file_is_refused(bag, share, alone):
     file = storage_file(bag)
     data = file.read_bytes()
@@ -201,7 +202,7 @@ def test_a_database_that_was_not_closed_is_refused(tmp_path):
 @pytest.mark.parametrize("storage", STORAGES)
 def test_a_bag_without_messages_is_refused(tmp_path, storage):
     kinds = {"/cmd_vel": bags.kinds.TWIST, "/pose": bags.kinds.POSE}
-    topics = {"/cmd_vel": [], "/pose": []}
+    topics: dict = {topic: [] for topic in kinds}
     bag = bags.write(tmp_path / "bag", topics, storage, kinds_of=kinds)
     assert "contains no messages" in refused(bag)
 

@@ -8,13 +8,12 @@ import pytest
 pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 import bags
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.bag_file import open_bag
-from nics_drl_bridge.recording.mapping import Mapping
+from nics_drl_bridge.recording.mapping import DriveMapping
 from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.readers import open_source, read_recording
 from nics_drl_bridge.recording.survey import inspect_tables
@@ -27,7 +26,7 @@ DEFINITION = "std_msgs/Header header\nfloat32[3] motor\nbool armed\nstring mode\
 def read(path, text):
     """Reads a bag by a mapping in YAML, with the pose of /pose."""
     given = {"pose": "/pose"} | parse_yaml(text, "mapping")
-    return read_recording(path, mapping=Mapping.model_validate(given))
+    return read_recording(path, mapping=DriveMapping.model_validate(given))
 
 
 def ros_1_bag(path: Path) -> Path:
@@ -60,18 +59,16 @@ def foreign_bag(path: Path) -> Path:
     """A rosbag2 with a type that only its own definition explains."""
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg(DEFINITION, FOREIGN))
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        drive = writer.add_connection("/drive", FOREIGN, typestore=store)
-        poses = writer.add_connection("/pose", bags.kinds.POSE, typestore=store)
-        for t in bags.times():
-            armed = t > 1.0
-            motor = np.array([0.0, t, 2.0 * t], np.float32)
-            mode = "auto" if armed else "manual"
-            message = store.types[FOREIGN](bags.header(t - 0.001), motor, armed, mode)
-            writer.write(drive, bags.ns(t), store.serialize_cdr(message, FOREIGN))
-            pose = bags.pose_stamped(t - 0.002, *bags.place_at(t))
-            writer.write(poses, bags.ns(t), store.serialize_cdr(pose, bags.kinds.POSE))
-    return path
+    drive = []
+    poses = []
+    for t in bags.times():
+        motor = np.array([0.0, t, 2.0 * t], np.float32)
+        armed = t > 1.0
+        mode = "auto" if armed else "manual"
+        about = (bags.header(t - 0.001), motor, armed, mode)
+        drive.append((t, store.types[FOREIGN](*about)))
+        poses.append((t, bags.pose_stamped(t - 0.002, *bags.place_at(t))))
+    return bags.write(path, {"/drive": drive, "/pose": poses}, store=store)
 
 
 def test_a_bag_of_ros_1_is_read_by_any_number_in_it(tmp_path):
@@ -136,11 +133,9 @@ def test_transforms_are_poses_between_two_frames(tmp_path):
 
     rows = [(t, both(t)) for t in bags.times()]
     bag = bags.write(tmp_path / "bag", {"/tf": rows, "/cmd_vel": bags.commands()})
-    mapping = "command: {v: '/cmd_vel:linear.x'}\npose: %s"
-    found = read(bag, mapping % "{in: /tf, child_frame: car}")
+    pose = "pose: {in: /tf, child_frame: car}"
+    found = read(bag, f"command: {{v: '/cmd_vel:linear.x'}}\n{pose}")
     assert np.allclose(found.pose.values[-1], bags.place_at(bags.times()[-1]))
-    with pytest.raises(RecordingError, match="holds several transforms"):
-        read(bag, mapping % "/tf")
 
 
 COMMAND = "command: {v: '/v:linear.x'}\n"
@@ -154,7 +149,6 @@ BY_HEADER = "pose: {in: /pose, time: header}"
         (5.0, "", ("header", "robot")),  # the headers are of a foreign clock
         (5.0, "time: arrival", ("robot", "robot")),
         (0.0, MOCAP, ("mocap", "robot")),
-        (5.0, MOCAP, ("mocap", "robot")),
         (5.0, MOCAP.replace("mocap", "robot"), ("robot", "robot")),
         (0.0, BY_HEADER, ("robot", "robot")),
         (5.0, BY_HEADER, ("header", "robot")),

@@ -9,16 +9,11 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.config import parse_yaml
-from nics_drl_bridge.errors import ConfigError, RecordingError
-from nics_drl_bridge.recording.mapping import Mapping, load_mapping
-from nics_drl_bridge.recording.mapping_draft import propose_mapping
-from nics_drl_bridge.recording.readers import open_source, read_recording
-from nics_drl_bridge.recording.survey import inspect_tables, split_unit
-from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.recording.survey import split_unit
 
-from .tables import write
+from .tables import draft, read_draft, write
 
-COUNT = 1200
+COUNT = 600
 STEP = 0.05
 
 
@@ -216,6 +211,12 @@ nothing moves:
 """
 
 
+def pick(columns: str) -> dict[str, np.ndarray]:
+    """Columns `name=signal`, or `name` of the signal with that name."""
+    pairs = (column.partition("=") for column in columns.split(", "))
+    return {name: M[signal or name] for name, _, signal in pairs}
+
+
 def read_tables() -> dict[str, tuple[dict[str, np.ndarray], str, list[str], Any]]:
     """Columns, x, heading or quaternion, and commands of each of `TABLES`."""
     tables = {}
@@ -224,22 +225,12 @@ def read_tables() -> dict[str, tuple[dict[str, np.ndarray], str, list[str], Any]
             ": | -> ", " ".join(table.split()), maxsplit=2
         )
         x, turned, commands = (part.strip() for part in guesses.split(";"))
-        signals = {}
-        for column in columns.split(", "):
-            name, _, signal = column.partition("=")
-            signals[name] = M[signal or name]
         named = dict(pair.split("=") for pair in commands.split(", ") if pair)
-        tables[style] = signals, x, turned.split(", "), named
+        tables[style] = pick(columns), x, turned.split(", "), named
     return tables
 
 
 STYLES = read_tables()
-
-
-def drafted(path) -> tuple[str, dict[str, Any]]:
-    with open_source(path) as source:
-        text = propose_mapping(inspect_tables(source)).text
-    return text, parse_yaml(text, "draft")
 
 
 def column_of(value: Any) -> str:
@@ -250,263 +241,138 @@ def column_of(value: Any) -> str:
 def test_a_draft_of_a_table_is_right_or_blank(tmp_path, style):
     columns, x, turned, commands = STYLES[style]
     path = write(tmp_path / "log.csv", columns)
-    text, draft = drafted(path)
-    pose = draft["pose"]
+    text, drafted = draft(path)
+    pose = drafted["pose"]
     found = pose.get("quaternion") or [column_of(pose.get("heading"))]
     assert (pose["x"] or "", found) == (x, turned), text
     guessed = {
-        name: column_of(value) for name, value in (draft["command"] or {}).items()
+        name: column_of(value) for name, value in (drafted["command"] or {}).items()
     }
     assert guessed == commands, text
     if x and commands:
-        drive = read_recording(path, mapping=Mapping.model_validate(draft))
-        assert drive.variables == tuple(commands)
+        assert read_draft(path, drafted).variables == tuple(commands)
+        assert "# doubt" not in text
+    if style in ("uncertainties", "ranges to both sides"):
+        assert "\n#  " not in text  # what can't have been sent is no candidate
 
 
-@pytest.mark.parametrize("style", ["uncertainties", "ranges to both sides"])
-def test_what_can_not_have_been_sent_is_no_candidate(tmp_path, style):
-    columns, *_ = STYLES[style]
-    assert "\n#  " not in drafted(write(tmp_path / "log.csv", columns))[0]
+CANDIDATES = {
+    "t, x, y, theta=yaw, v=speed, w=rate": "#  forward_command: v\n#  turn_command: w",
+    "t, x, y, yaw, v, w, left_ticks=left, right_ticks=right": (
+        "#  or forward_command: v\n#  or turn_command: w"
+    ),
+    "t, x, y, yaw, imu_wz=rate, vitesse=v, virage=w, still=zero": (
+        "#  command_0: vitesse\n#  command_1: virage"
+    ),
+}
+
+
+@pytest.mark.parametrize("columns", CANDIDATES)
+def test_what_may_have_been_sent_is_listed_as_comments_to_uncomment(tmp_path, columns):
+    path = write(tmp_path / "log.csv", pick(columns))
+    text, drafted = draft(path)
+    lines = CANDIDATES[columns]
+    assert f"{lines}\n" in text
+    assert "command_2" not in text
+    assert "no command was recorded" not in text
+    if drafted["command"] is None:
+        chosen = parse_yaml(text.replace("#  ", "  "), "draft")
+        assert read_draft(path, chosen).variables == tuple(chosen["command"])
+    else:
+        assert drafted["command"].keys() == {"left_wheel", "right_wheel"}
+        told = "none is certain: the measured wheel motion is used instead"
+        assert told in text
 
 
 def test_columns_without_a_name_are_candidates(tmp_path):
-    numbers = np.arange(COUNT)
-    columns = [numbers, *(M[key] for key in ("t", "x", "y", "yaw", "v", "w"))]
-    rows = [", ".join(map(repr, map(float, row))) for row in zip(*columns, strict=True)]
-    path = tmp_path / "drive.txt"
-    path.write_text("row, t, x, y, yaw\n" + "\n".join(rows) + "\n")
-    text, draft = drafted(path)
-    assert draft["pose"] == {"x": "x", "y": "y", "heading": "yaw"}
-    assert "no command was recorded" not in text
+    columns = pick("row, t, x, y, yaw, v, w")
+    path = write(tmp_path / "drive.txt", columns, ", ")
+    path.write_text(path.read_text().replace(", v, w", "", 1))
+    text, drafted = draft(path)
+    assert drafted["pose"] == {"x": "x", "y": "y", "heading": "yaw"}
     assert "#  command_0: 5\n#  command_1: 6\n" in text
 
 
-def test_wheels_that_stand_in_leave_other_candidates_as_comments(tmp_path):
-    keys = ("t", "x", "y", "yaw", "v", "w")
-    columns = {key: M[key] for key in keys}
-    columns |= {"left_ticks": M["left"], "right_ticks": M["right"]}
-    text, draft = drafted(write(tmp_path / "log.csv", columns))
-    assert draft["command"].keys() == {"left_wheel", "right_wheel"}
-    assert "no command was recorded" not in text
-    assert "none is certain: the measured wheel motion is used instead" in text
-    assert "#  or forward_command: v\n#  or turn_command: w\n" in text
+UNITS = """
+x(m): m; x [mm]: mm; yaw_deg: deg; phi(rad): rad; v [m s^-1]: m/s; w (deg/s): deg/s;
+speed_kmh: km/h; left_rpm: rpm; motor_rpm_left_cmd: rpm; v_m_s: m/s; acc (m/s^2): m/s^2;
+heading (°): deg; omega_rad_per_s: rad/s; q_w []: ; cov[0]: ; acc x (IMU):
+"""
 
 
-def test_columns_that_no_word_explains_are_candidates(tmp_path):
-    given = {
-        "t": M["t"],
-        "x": M["x"],
-        "y": M["y"],
-        "yaw": M["yaw"],
-        "imu_wz": M["rate"],
-    }
-    given |= {"vitesse_consigne": M["v"], "virage_consigne": M["w"], "still": M["zero"]}
-    text, _ = drafted(write(tmp_path / "drive.csv", given))
-    assert "no command was recorded" not in text
-    assert "#  command_0: vitesse_consigne\n#  command_1: virage_consigne\n" in text
-    assert "command_2" not in text
-
-
-def test_a_blank_lists_the_candidates_as_comments_that_can_be_uncommented(tmp_path):
-    columns, *_ = STYLES["bare v and w"]
-    path = write(tmp_path / "log.csv", columns)
-    text, draft = drafted(path)
-    assert draft["command"] is None
-    assert "#  forward_command: v\n#  turn_command: w\n" in text
-    chosen = text.replace("#  ", "  ")
-    drive = read_recording(
-        path, mapping=Mapping.model_validate(parse_yaml(chosen, "draft"))
-    )
-    assert drive.variables == ("forward_command", "turn_command")
-
-
-def test_a_blank_draft_is_refused_with_what_is_missing(tmp_path):
-    (tmp_path / "my.yaml").write_text("robot: differential\npose: /odom\ncommand:\n")
-    with pytest.raises(
-        ConfigError, match=r"command: names none.*record it together with the pose"
-    ):
-        load_mapping(tmp_path / "my.yaml")
-
-
-@pytest.mark.parametrize(
-    "column",
-    ["latitude", "/fix:longitude", "gps altitude (m)", "pose.covariance[0]", "cov_xx"],
-)
-def test_places_on_earth_and_covariances_are_refused_as_commands(tmp_path, column):
-    text = (
-        f'robot: differential\npose: /odom\ncommand: {{forward_command: "{column}"}}\n'
-    )
-    (tmp_path / "my.yaml").write_text(text)
-    with pytest.raises(
-        ConfigError, match=r"command\.forward_command: .* was not sent to the rob"
-    ):
-        load_mapping(tmp_path / "my.yaml")
-
-
-@pytest.mark.parametrize(
-    ("which", "name"), [(4, "latitude"), ("lat", "lat"), (4, "cov_xx")]
-)
-def test_they_are_refused_by_number_and_by_short_names_too(tmp_path, which, name):
-    columns = {"t": M["t"], "x": M["x"], "y": M["y"], "yaw": M["yaw"], name: M["lat"]}
-    path = write(tmp_path / "log.csv", columns)
-    given = {
-        "time": "t",
-        "pose": {"x": "x", "y": "y", "heading": "yaw"},
-        "command": {"v": which},
-    }
-    with pytest.raises(ConfigError, match=r"command\.v: .* was not sent to the robot"):
-        read_recording(path, mapping=Mapping.model_validate(given))
-
-
-@pytest.mark.parametrize(
-    ("column", "unit"),
-    [
-        ("x(m)", "m"),
-        ("x [mm]", "mm"),
-        ("yaw_deg", "deg"),
-        ("phi(rad)", "rad"),
-        ("v [m s^-1]", "m/s"),
-        ("w (deg/s)", "deg/s"),
-        ("speed_kmh", "km/h"),
-        ("left_rpm", "rpm"),
-        ("motor_rpm_left_cmd", "rpm"),
-        ("v_m_s", "m/s"),
-        ("acc (m/s^2)", "m/s^2"),
-        ("heading (°)", "deg"),
-        ("q_w []", None),
-        ("cov[0]", None),
-        ("acc x (IMU)", None),
-        ("omega_rad_per_s", "rad/s"),
-    ],
-)
-def test_units_are_read_from_names(column, unit):
-    assert split_unit(column)[1] == unit
+def test_units_are_read_from_names():
+    for row in UNITS.split(";"):
+        name, _, unit = row.strip().partition(":")
+        assert split_unit(name)[1] == (unit.strip() or None), name
 
 
 def switched(name: str, on: float, off: float) -> dict[str, np.ndarray]:
     """A drive with a switch that cut the motor for its second third, in which it stood."""
-    cut = (M["t"] > 20.0) & (M["t"] < 40.0)
+    cut = (M["t"] > 10.0) & (M["t"] < 20.0)
     shift = np.cumsum(np.where(cut, 0.0, 1.0)).astype(int) - 1
     pose = {key: M[key][shift] for key in ("x", "y", "yaw")}
-    return {
-        "t": M["t"],
-        **pose,
-        "throttle": M["v"],
-        "steering": M["w"],
-        name: np.where(cut, off, on),
-    }
+    commands = pick("t, throttle=v, steering=w")
+    return commands | pose | {name: np.where(cut, off, on)}
 
 
 @pytest.mark.parametrize(
-    ("name", "on", "off"),
+    ("name", "on", "off", "known"),
     [
-        ("safety_value", 1.0, 0.0),
-        ("estop", 0.0, 1.0),
-        ("enabled", 1, 0),
-        ("dead_man_switch", 1, 0),
-        ("motors_on", 1, 0),
-        ("motor_enable", 1234567, 0),
+        ("safety_value", 1.0, 0.0, True),
+        ("estop", 0.0, 1.0, True),
+        ("dead_man_switch", 1, 0, True),
+        ("motors_on", 1, 0, True),
+        ("motor_enable", 1234567, 0, True),
+        ("light", 1.0, 0.0, False),
+        ("enable", 1.0, 0.5, False),
+        ("light_on", 1, 0, False),
     ],
 )
-def test_a_switch_of_two_values_is_recognised(tmp_path, name, on, off):
-    _, draft = drafted(write(tmp_path / "log.csv", switched(name, on, off)))
-    assert draft["command"]["throttle"]["when"] == {name: on}
-    assert draft["command"]["steering"] == "steering"
-
-
-@pytest.mark.parametrize(
-    ("name", "on", "off"),
-    [("light", 1.0, 0.0), ("enable", 1.0, 0.5), ("light_on", 1, 0)],
-)
-def test_a_column_without_the_name_or_values_of_a_switch_is_none(
-    tmp_path, name, on, off
+def test_a_switch_of_two_values_is_recognised_by_name_and_values(
+    tmp_path, name, on, off, known
 ):
-    _, draft = drafted(write(tmp_path / "log.csv", switched(name, on, off)))
-    assert draft["command"]["throttle"] == "throttle"
+    _, drafted = draft(write(tmp_path / "log.csv", switched(name, on, off)))
+    throttle = {"from": "throttle", "when": {name: on}} if known else "throttle"
+    assert drafted["command"] == {"throttle": throttle, "steering": "steering"}
 
 
-def test_all_of_several_switches_must_be_on(tmp_path):
-    columns = switched("enabled", 1, 0) | {"estop": (M["t"] < 1.0).astype(float)}
-    _, draft = drafted(write(tmp_path / "log.csv", columns))
-    assert draft["command"]["throttle"]["when"] == {"enabled": 1, "estop": 0}
-
-
-def test_switches_that_are_never_on_together_are_none(tmp_path):
+@pytest.mark.parametrize("together", [True, False])
+def test_all_of_several_switches_must_be_on_if_they_ever_are_together(
+    tmp_path, together
+):
     columns = switched("enabled", 1, 0)
-    columns["active"] = 1 - columns["enabled"]
-    _, draft = drafted(write(tmp_path / "log.csv", columns))
-    assert draft["command"]["throttle"] == "throttle"
-
-
-def test_a_table_without_rows_hides_no_switch_of_another(tmp_path):
-    write(tmp_path / "log.csv", switched("enabled", 1, 0))
-    (tmp_path / "empty.csv").write_text("t,volume\n")
-    _, draft = drafted(tmp_path)
-    assert draft["command"]["throttle"]["when"]
-
-
-def test_a_command_that_the_motion_does_not_follow_is_said_on_top(tmp_path):
-    columns = {key: M[key] for key in ("t", "x", "y", "yaw")}
-    noise = np.repeat(np.random.default_rng(8).normal(size=COUNT // 20), 20)
-    path = write(tmp_path / "log.csv", columns | {"cmd_v": noise, "cmd_w": M["w"]})
-    first = drafted(path)[0].splitlines()[0]
-    assert first.startswith("# doubt: the motion hardly follows log.csv:cmd_v;")
-
-
-@pytest.mark.parametrize(("shift", "words"), [(2.0, "follows"), (-0.8, "precedes")])
-def test_a_command_that_no_latency_explains_is_said_on_top(tmp_path, shift, words):
-    pose = {"t": M["t"] + shift, **{key: M[key] for key in ("x", "y", "yaw")}}
-    write(tmp_path / "pose.csv", pose)
-    write(tmp_path / "cmd.csv", {"t": M["t"], "v": M["v"], "w": M["w"]})
-    first = drafted(tmp_path)[0].splitlines()[0]
-    assert first.startswith(f"# doubt: the motion {words} cmd.csv:v ")
-
-
-def test_a_right_command_raises_no_doubt(tmp_path):
-    columns, *_ = STYLES["issue"]
-    text, _ = drafted(write(tmp_path / "log.csv", columns))
-    assert "# doubt" not in text
+    active = np.where(M["t"] < 1.0, 0, 1) if together else 1 - columns["enabled"]
+    write(tmp_path / "log.csv", columns | {"active": active})
+    (tmp_path / "empty.csv").write_text("t,volume\n")  # hides no switch of another
+    throttle = draft(tmp_path)[1]["command"]["throttle"]
+    if together:
+        assert throttle["when"] == {"log.csv:enabled": 1, "log.csv:active": 1}
+    else:
+        assert throttle == "log.csv:throttle"
 
 
 def test_the_car_of_the_validation_drive_is_drafted_whole(shared_recordings):
-    _, draft = drafted(shared_recordings / "jetracer_dart" / "long_prediction_69s.csv")
-    assert draft["command"]["throttle"] == {
-        "from": "throttle",
-        "when": {"safety_value": 1},
-    }
-    assert draft["command"]["steering"] == "steering"
-    assert draft["time"] == "vicon time"
-
-
-@pytest.mark.slow
-def test_a_bag_without_commands_is_told_what_it_lacks(shared_recordings):
-    bag = shared_recordings / "robot_localization" / "husky_outdoor_395s.bag"
-    text, draft = drafted(bag)
-    assert text.startswith("# doubt: no command was recorded")
-    assert draft["command"] is None
-    assert draft["robot"] is None
-    assert draft["pose"] == "/husky_velocity_controller/odom"
-    robot = load_robot("differential")
-    with pytest.raises(
-        RecordingError, match="a model learns from the robot's commands"
-    ):
-        read_recording(bag, robot)
+    file = shared_recordings / "jetracer_dart" / "long_prediction_69s.csv"
+    _, drafted = draft(file)
+    throttle = {"from": "throttle", "when": {"safety_value": 1}}
+    assert drafted["command"] == {"throttle": throttle, "steering": "steering"}
+    assert drafted["time"] == "vicon time"
 
 
 def test_what_names_do_not_show_of_a_real_recording_is_blank_or_in_doubt(
     shared_recordings,
 ):
     file = shared_recordings / "differential_ticks" / "Camera_Odo_Data_01.txt"
-    text, draft = drafted(file)
+    text, drafted = draft(file)
     assert text.splitlines()[0].endswith("add `unit: cm`")
-    other, draft_of_other = drafted(file.with_name("Camera_Odo_Data_02.txt"))
-    assert draft_of_other["command"] is None  # the names of the wheels are missing
-    assert "#  command_0: 13\n#  command_1: 14\n" in other
-    assert draft["pose"] == {"x": "pose.x", "y": "pose.y", "heading": "pose.z"}
-    assert draft["command"] == {
+    assert drafted["pose"] == {"x": "pose.x", "y": "pose.y", "heading": "pose.z"}
+    assert drafted["command"] == {
         "left_wheel": {"from": "Left_Tick", "unit": "ticks"},
         "right_wheel": {"from": "Right_Tick", "unit": "ticks"},
     }
     assert text.count("guessed; add `ticks_per_turn:`") == 2
     assert "no command was recorded: the measured wheel motion is used instead" in text
     assert "\n#  or " not in text
+    other, drafted = draft(file.with_name("Camera_Odo_Data_02.txt"))
+    assert drafted["command"] is None  # the names of the wheels are missing
+    assert "#  command_0: 13\n#  command_1: 14\n" in other

@@ -83,10 +83,11 @@ def test_without_stamps_the_time_of_receipt_counts():
     assert recording.pose.t[0] - recording.command.t[0] == pytest.approx(0.02)
 
 
-def test_the_pose_of_motion_capture_and_the_imu_are_taken():
+def test_pose_of_motion_capture_imu_and_then_the_twist_of_the_odometry_are_taken():
     drive = Drive()
     for k in range(20):
-        drive.goes(k, k + 1)
+        drive.sends(k)
+        drive.hears(k, twist=(0.1 * k, 0.0, math.nan if k == 5 else -0.2))
         pose = PoseStamped()
         imu = Imu()
         for message in (pose, imu):
@@ -96,23 +97,13 @@ def test_the_pose_of_motion_capture_and_the_imu_are_taken():
         imu.linear_acceleration.x, imu.angular_velocity.z = 0.3, -0.7
         drive.log.add("pose", get_stamp(pose), read_pose(pose))
         drive.log.add("imu", get_stamp(imu), read_imu(imu))
-    recording = drive.log.make_recording()
+    recording = check(drive.log.make_recording(), CAR)
     assert recording.pose.values[-1] == pytest.approx([0.0, 3.8, 0.5])
     assert recording.imu.values[-1] == pytest.approx([0.3, 0.0, -0.7])
-
-
-def test_beside_a_pose_of_motion_capture_the_twist_of_the_odometry_is_taken():
-    drive = Drive()
-    for k in range(20):
-        drive.sends(k)
-        drive.hears(k, twist=(0.1 * k, 0.0, math.nan if k == 5 else -0.2))
-        pose = PoseStamped()
-        pose.header.stamp = conversions.stamp_to_ros(START_NS + k * PERIOD_NS)
-        drive.log.add("pose", get_stamp(pose), read_pose(pose))
-    recording = check(drive.log.make_recording(), CAR)
     assert recording.odometry.values[-1] == pytest.approx([1.9, 0.0, -0.2])
     assert len(recording.odometry.t) == 19
     assert recording.odometry.clock == recording.command.clock
+    assert recording.measured_by == "tracker"
 
 
 def test_measured_wheels_are_the_state():

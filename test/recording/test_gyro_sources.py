@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.recording.readers import read_recording
-from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.topic_roles import (
     ODOMETRY,
     POSE,
@@ -17,7 +16,7 @@ from nics_drl_bridge.recording.topic_roles import (
 )
 from nics_drl_bridge.robot.spec import load_robot
 
-HEADER = "t,cmd_v,cmd_w,odom_x,odom_y,odom_yaw,second\n"
+from .tables import drive, read, write
 
 
 @pytest.mark.parametrize(
@@ -46,51 +45,23 @@ def test_any_topic_of_its_type_is_the_imu_of_a_bag(tmp_path, topic):
     topics["/odom"] = [(t, bags.odometry(t, *bags.place_at(t))) for t in bags.times()]
     topics.pop("/pose", None)
     bag = bags.write(tmp_path / "bag", topics | {topic: rows})
-    read = read_recording(bag, load_robot("differential"), TopicRoles())
-    assert read.imu is not None
-    assert read.measured_by == "odometry"
+    found = read_recording(bag, load_robot("differential"), TopicRoles())
+    assert found.imu is not None
+    assert found.measured_by == "odometry"
 
 
-def table(tmp_path, rows=400):
-    t = np.arange(rows) * 0.05
-    heading = 0.3 * t
-    second = np.degrees(heading) % 360.0
-    pose = [np.sin(heading), 1.0 - np.cos(heading), heading]
-    columns = [t, np.full(rows, 0.3), np.full(rows, 0.3), *pose, second]
-    path = tmp_path / "drive.csv"
-    text = "\n".join(
-        ",".join(f"{v:.6f}" for v in row) for row in np.stack(columns, axis=1)
-    )
-    path.write_text(HEADER + text + "\n", encoding="utf-8")
-    return path
+POSE = "pose: {x: odom_x, y: odom_y, heading: odom_yaw%s}\n"
 
 
-def test_a_second_heading_column_is_a_turn_rate(tmp_path):
-    mapping = tmp_path / "map.yaml"
-    mapping.write_text(
-        "robot: differential\ntime: t\n"
-        "pose: {x: odom_x, y: odom_y, heading: odom_yaw}\n"
-        "command: {forward_command: cmd_v, turn_command: cmd_w}\n"
-        "imu: {heading: {from: second, unit: deg}}\n",
-        encoding="utf-8",
-    )
-    read = read_recording(table(tmp_path), mapping=mapping)
-    assert read.measured_by == "odometry"
-    assert read.imu.values[:, 2] == pytest.approx(0.3, abs=1e-3)
-    assert load_recording(saved(read, tmp_path)).measured_by == "odometry"
-
-
-def saved(recording, folder):
-    save_recording(recording, folder / "saved.npz")
-    return folder / "saved.npz"
-
-
-def test_a_mapping_says_itself_what_measured_the_pose(tmp_path):
-    mapping = tmp_path / "map.yaml"
-    mapping.write_text(
-        "robot: differential\ntime: t\n"
-        "pose: {x: odom_x, y: odom_y, heading: odom_yaw, measured_by: tracker}\n"
-        "command: {forward_command: cmd_v, turn_command: cmd_w}\n",
-        encoding="utf-8",
-    )
-    assert read_recording(table(tmp_path), mapping=mapping).measured_by == "tracker"
+@pytest.mark.parametrize(
+    ("key", "measured_by"), [("", "odometry"), (", measured_by: tracker", "tracker")]
+)
+def test_a_second_heading_column_is_a_turn_rate(tmp_path, key, measured_by):
+    columns = drive()
+    odometry = {f"odom_{name}": columns[name] for name in ("x", "y", "yaw")}
+    second = {"second": np.degrees(columns["yaw"] * 30.0) % 360.0}
+    path = write(tmp_path / "log.csv", columns | odometry | second)
+    changes = f"{POSE % key}imu: {{heading: {{from: second, unit: deg}}}}"
+    found = read(path, changes)
+    assert found.imu.values[:, 2] == pytest.approx(0.25 * 30.0, abs=1e-3)
+    assert found.measured_by == measured_by  # by the names, unless the mapping says it

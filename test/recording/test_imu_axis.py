@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.recording.imu_axis import GyroReader, UpAxis, find_up_axis
-from nics_drl_bridge.recording.mapping_draft import propose_mapping
-from nics_drl_bridge.recording.readers import open_source, read_recording
-from nics_drl_bridge.recording.survey import inspect_tables
+from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.topic_roles import IMU, TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
+
+from .tables import draft
 
 
 def mounted(t, rate, axis, sign):
@@ -66,7 +66,6 @@ def test_the_imu_of_a_bag_and_of_its_draft_is_read_as_it_is_mounted(
     read = read_recording(bag, load_robot("differential"), TopicRoles())
     assert read.imu.values[:, 2].mean() == pytest.approx(0.25, abs=0.08)
     assert any("points up" in told for told in read.repairs)
-    with open_source(bag) as source:
-        draft = propose_mapping(inspect_tables(source)).text
-    assert f"/imu/data:angular_velocity.{'xyz'[axis]}" in draft
-    assert ("scale: -1" in draft) == (sign < 0.0)
+    text, _ = draft(bag)
+    assert f"/imu/data:angular_velocity.{'xyz'[axis]}" in text
+    assert ("scale: -1" in text) == (sign < 0.0)

@@ -3,13 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nics_drl_bridge.config import dump_yaml, parse_yaml
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.mapping import load_mapping
 from nics_drl_bridge.recording.readers import (
     open_drive,
     reorder_variables,
 )
-from nics_drl_bridge.recording.recording import load_recording, save_recording
+from nics_drl_bridge.recording.recording import save_recording
 from nics_drl_bridge.robot.spec import load_robot
 
 from .tables import change_map, drive, read, write
@@ -151,19 +152,6 @@ def test_an_absolute_encoder_is_an_angle_about_zero(tmp_path, columns):
     assert np.allclose(found.command.values[:, 0], angle, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("reach", "period"), [(50.0, 0.5), (1000.0, 100.0), (0.0, 1.0)]
-)
-def test_a_wheel_that_goes_to_and_fro_or_trembles_is_counted(
-    tmp_path, columns, reach, period
-):
-    turned = reach * np.sin(columns["t"] * 2.0 * np.pi / period)
-    ticks = np.round(turned) + np.round(np.sin(columns["t"] * 100.0))
-    path = write(tmp_path / "log.csv", columns | {"n": ticks})
-    found = read(path, "command: {left: {from: n, unit: ticks}}")
-    assert len(found.command.values) == len(ticks) - 1
-
-
 def test_a_folder_has_its_values_in_several_files(tmp_path, columns):
     pick = ("t", "x", "y", "yaw")
     write(tmp_path / "pose.csv", {name: columns[name] for name in pick})
@@ -206,6 +194,8 @@ def spoil(columns):
     t = columns["t"]
     wavy = 400.0 * np.sin(t * 3.0)
     more = {
+        "cov_xx": t,
+        "lat": 47.5 + t / 1e5,
         "ms": t * 1e3,
         "still": t * 0.0,
         "short": t / 3600.0,
@@ -240,7 +230,8 @@ def spoil(columns):
         ("command: {v: {from: count, unit: rpm}}", "{from: count, unit: ticks, "),
         ("command: {v: back}", "{from: back, unit: ticks, "),
         ("command: {v: {from: back, unit: m/s}}", "went on by 7960"),
-        ("command: {v: {from: back, unit: ticks/s}}", "{from: back, unit: ticks, "),
+        ("command: {v: lat}", "'lat' looks like a latitude or longitude, which was"),
+        ("command: {v: 6}", "'cov_xx' shows how uncertain a measurement is"),
         ("command: {v: {from: noisy, unit: ticks}}", "`unit: ticks/s`"),
         ("pose: {x: x, y: y, heading: deg}", "`heading_unit: deg`"),
         ("pose: {x: mm, y: mm, heading: yaw}", "`unit: mm`"),
@@ -263,22 +254,18 @@ def test_what_only_a_wrong_mapping_explains_is_refused_with_the_line_to_write(
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("pose: {x: 1, y: 2, heading: 3}\ncommand: {v: {form: 1}}", "mean 'from'?"),
-        ("pose: {x: 1, y: 2}\ncommand: {v: 1}", "either heading or quaternion"),
-        ("pose: {x: 1, y: 2, heading: 3, unit: ms}\ncommand: {v: 1}", "one of m, dm"),
-        (
-            "pose: {x: 1, y: 2, heading: 3}\ncommand: {v: {from: 1, unit: kmph}}",
-            "mean 'mph'?",
-        ),
-        (
-            "pose: {x: 1, y: 2, heading: 3, covariance: [1, 2]}\ncommand: {v: 1}",
-            "3, 9 or 36",
-        ),
-        ("pose: {x: 1, y: 2, heading: 3}\ncommand: {}", "command: names none"),
+        ("command: {v: {form: 1}}", "mean 'from'?"),
+        ("pose: {x: 1, y: 2}", "either heading or quaternion"),
+        ("pose: {x: 1, y: 2, heading: 3, unit: ms}", "one of m, dm"),
+        ("command: {v: {from: 1, unit: kmph}}", "mean 'mph'?"),
+        ("pose: {x: 1, y: 2, heading: 3, covariance: [1, 2]}", "3, 9 or 36"),
+        ("command:", "command: names none, but "),
+        ('command: {v: "/fix:longitude"}', "shows where the robot was, and was not"),
     ],
 )
 def test_a_mapping_that_is_none_is_refused_with_file_and_key(tmp_path, text, sentence):
-    (tmp_path / "my.yaml").write_text(text)
+    given = {"pose": "/odom", "command": {"v": 1}} | parse_yaml(text, "changes")
+    (tmp_path / "my.yaml").write_text(dump_yaml(given))
     with pytest.raises(ConfigError) as refused:
         load_mapping(tmp_path / "my.yaml")
     assert "my.yaml: " in str(refused.value)
@@ -316,23 +303,9 @@ def test_a_robots_file_is_one_robot_however_it_is_named_and_is_kept(tmp_path, co
     back, again = open_drive(tmp_path / "drive.npz")
     assert back == spec
     assert same(drive, again)
-    assert open_drive(tmp_path / "drive.npz", "ackermann")[0].name == "ackermann"
-
-
-def test_an_imported_drive_keeps_deviations_and_repairs(tmp_path, columns):
-    more = columns | {"c": np.full(200, 4.0)}
-    more["t"] = np.concatenate([more["t"][:150], more["t"][150:] - 3.0])
-    pose = "pose: {x: x, y: y, heading: yaw, covariance: [c, c, c]}"
-    drive = read(write(tmp_path / "log.csv", more), pose)
-    file = tmp_path / "drive.npz"
-    save_recording(drive, file)
-    back = load_recording(file)
-    assert np.array_equal(back.pose.sigma, drive.pose.sigma)
-    assert back.command.sigma is None
-    assert back.repairs == drive.repairs != ()
-    assert back.variables == ("v", "w")
-    # Of a recording of this package a mapping tells the robot only.
-    assert same(back, read(file, "{robot: ackermann, command: {x: 3}}"))
+    by_mapping = change_map("{robot: ackermann, command: {x: 3}}")
+    for named in (("ackermann", None), (None, by_mapping)):  # tells the robot only
+        assert open_drive(tmp_path / "drive.npz", *named)[0].name == "ackermann"
 
 
 def test_poses_far_from_the_origin_of_a_fast_car_are_read(tmp_path, columns):

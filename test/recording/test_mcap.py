@@ -61,6 +61,17 @@ def written(path, size=2000, data=DATA, **options):
     return path
 
 
+def refused(path, said=""):
+    with pytest.raises(RecordingError, match=said), open_bag(path):
+        pass
+
+
+def mapped(path):
+    """The records of a file, with the offset after each."""
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        return list(read_records(data))
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_files_of_another_writer_are_whole(tmp_path, form):
     path = written(tmp_path / "drive.mcap", **FORMS[form])
@@ -78,8 +89,7 @@ def test_a_file_that_is_cut_off_anywhere_or_goes_on_is_refused(tmp_path, form):
     cut = [data[:end] for end in range(0, len(data), len(data) // 20)]
     for damaged in (*cut, *(part + MAGIC for part in cut), data + b"more"):
         path.write_bytes(damaged)
-        with pytest.raises(RecordingError), open_bag(path):
-            pass
+        refused(path)
 
 
 def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(
@@ -92,17 +102,8 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(
     monkeypatch.setattr(mcap, "MOST_UNPACKED", 2**20)
     for data in (path.read_bytes(), without_summary(path)):
         path.write_bytes(data)
-        with (
-            pytest.raises(RecordingError, match="more than 1048576 bytes"),
-            open_bag(path),
-        ):
-            pass
-        bag = packed_as_a_whole(tmp_path / "bag", data)
-        with (
-            pytest.raises(RecordingError, match="more than 1048576 bytes"),
-            open_bag(bag),
-        ):
-            pass
+        for place in (path, packed_as_a_whole(tmp_path / "bag", data)):
+            refused(place, "more than 1048576 bytes")
 
 
 def packed_as_a_whole(folder, data):
@@ -117,24 +118,16 @@ def packed_as_a_whole(folder, data):
 def test_a_chunk_that_says_that_it_is_terabytes_is_refused(tmp_path):
     path = written(tmp_path / "drive.mcap", **FORMS["bare"])
     data = bytearray(path.read_bytes())
-    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as mapped:
-        end, chunk = next(
-            (end, each) for end, each in read_records(mapped) if isinstance(each, Chunk)
-        )
+    end, chunk = next(pair for pair in mapped(path) if isinstance(pair[1], Chunk))
     place = end - len(chunk.data) - len(chunk.compression) - 24
     assert struct.unpack_from("<Q", data, place)[0] == chunk.uncompressed_size
     struct.pack_into("<Q", data, place, 2**42)
     path.write_bytes(data)
-    with (
-        pytest.raises(RecordingError, match="not have its stated length"),
-        open_bag(path),
-    ):
-        pass
+    refused(path, "not have its stated length")
 
 
 def find_data_end(path):
-    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as mapped:
-        return next(e for e, each in read_records(mapped) if isinstance(each, DataEnd))
+    return next(end for end, each in mapped(path) if isinstance(each, DataEnd))
 
 
 def without_summary(path):
@@ -157,8 +150,7 @@ def test_a_flipped_bit_of_a_sealed_file_is_found(tmp_path):
     assert zlib.crc32(data[:end]) == struct.unpack_from("<I", data, end + 9)[0]
     for place in range(len(MAGIC), len(data), 101):
         path.write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
-        with pytest.raises(RecordingError), open_bag(path):
-            pass
+        refused(path)
 
 
 def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
@@ -166,9 +158,7 @@ def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(
         messages, "find_spec", lambda name: None if name == "mcap" else name
     )
-    said = r"library mcap; .*nics_drl_bridge\[bags\]"
-    with pytest.raises(RecordingError, match=said), open_bag(path):
-        pass
+    refused(path, r"library mcap; .*nics_drl_bridge\[bags\]")
 
 
 ZSTD = mcap._import_zstd()

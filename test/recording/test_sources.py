@@ -53,30 +53,25 @@ def test_parquet_without_its_library_is_one_sentence(tmp_path, monkeypatch):
         read(tmp_path / "log.parquet")
 
 
-def test_parquet_is_read_with_its_stamps(tmp_path, columns):
+def write_parquet(path, columns):
     pyarrow = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")
-    dates = (
-        (np.round(columns["t"] * 1e9) + 1.7e18)
-        .astype(np.int64)
-        .astype("datetime64[ns]")
-    )
-    parquet.write_table(
-        pyarrow.table(columns | {"date": dates}), tmp_path / "log.parquet"
-    )
-    found = read(tmp_path / "log.parquet", "time: date")
-    assert np.allclose(found.pose.t, columns["t"], atol=1e-6)
+    parquet.write_table(pyarrow.table(columns), path)
+    return path
+
+
+def test_parquet_is_read_with_its_stamps(tmp_path, columns):
+    ns = (np.round(columns["t"] * 1e9) + 1.7e18).astype(np.int64)
+    dates = {"date": ns.astype("datetime64[ns]")}
+    path = write_parquet(tmp_path / "log.parquet", columns | dates)
+    assert np.allclose(read(path, "time: date").pose.t, columns["t"], atol=1e-6)
 
 
 @pytest.mark.parametrize("each", [["a"], b"\xff\xfe", {"deg": 1.5}, [1.0, 2.0], None])
 def test_a_column_of_parquet_that_holds_no_numbers_is_let_be(tmp_path, columns, each):
-    pyarrow = pytest.importorskip("pyarrow")
-    parquet = pytest.importorskip("pyarrow.parquet")
-    other = pyarrow.array([each] * len(columns["t"]))
-    parquet.write_table(
-        pyarrow.table(columns | {"other": other}), tmp_path / "log.parquet"
-    )
-    assert np.allclose(read(tmp_path / "log.parquet").pose.values[:, 0], columns["x"])
+    other = {"other": [each] * len(columns["t"])}
+    path = write_parquet(tmp_path / "log.parquet", columns | other)
+    assert np.allclose(read(path).pose.values[:, 0], columns["x"])
 
 
 def test_a_folder_without_tables_and_a_path_that_is_none_are_refused(tmp_path):

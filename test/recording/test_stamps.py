@@ -115,6 +115,16 @@ def test_a_counter_is_told_from_commands_that_jump_to_and_fro():
 
 
 @pytest.mark.parametrize(
+    ("reach", "period"), [(50.0, 0.5), (1000.0, 100.0), (0.0, 1.0)]
+)
+def test_a_wheel_that_goes_to_and_fro_or_trembles_is_a_counter(reach, period):
+    t = np.arange(200) * 0.02
+    turned = reach * np.sin(t * 2.0 * np.pi / period)
+    ticks = np.round(turned) + np.round(np.sin(t * 100.0))
+    assert not stamping.is_oscillating(ticks)
+
+
+@pytest.mark.parametrize(
     ("dates", "seconds"),
     [
         (["2024-05-01 02:59:59+02:00", "2024-05-01T02:00:00+0100"], [-1.0, 0.0]),

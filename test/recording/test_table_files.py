@@ -51,10 +51,30 @@ def test_titles_a_separator_at_the_end_and_repeated_headers_are_no_rows(tmp_path
     assert found.row(2) == "line 7"
 
 
-def test_a_header_may_be_a_comment_shorter_than_the_rows_or_lack_a_name(tmp_path):
-    assert table(tmp_path, "# t x\n0 1\n1 2\n").names == ("t", "x")
-    assert table(tmp_path, "a,b\n1,2,3\n4,5,6\n").names == ("a", "b", "")
-    assert table(tmp_path, ",s,ns\n0,1,2\n0,3,4\n").names == ("", "s", "ns")
+TUM = "10.0 1 2 0 0 0 0.6 0.8\n10.1 1 2 0 0 0 0.6 0.8\n"
+# A table; the names of its columns, and the numbers in the last one.
+FORMS = {
+    "a header in a comment": ("# t x\n0 1\n1 2\n", "t x", [1, 2]),
+    "a comment of Matlab": ("% t, x\n0,1\n1,2\n", "t x", [1, 2]),
+    "fewer names than columns": ("a,b\n1,2,3\n4,5,6\n", "a b ", [3, 6]),
+    "a column without a name": (",s,ns\n0,1,2\n0,3,4\n", " s ns", [2, 4]),
+    "a TUM trajectory": (TUM, "timestamp tx ty tz qx qy qz qw", [0.8, 0.8]),
+    "a row of units": ("Log, robot 3\nt,x,y\ns,m,m\n0,1,2\n1,2,3\n", "t x y", [2, 3]),
+    "quoted numbers": ('t,x\n"0,5","1,25"\n"0,6","1,75"\n', "t x", [1.25, 1.75]),
+    "odd separators": ("t~x\n0~1.5\n1~2.5\n", "t x", [1.5, 2.5]),
+    "colons": ("t:x\n0:1.5\n1:2.5\n", "t x", [1.5, 2.5]),
+    "an old Windows tool, in latin-1": ("t;[°]\n0;1,5\n1;2,5\n", "t [°]", [1.5, 2.5]),
+    "Excel, in utf-16": ("t\tx\n0\t1\n", "t x", [1]),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_table_of_this_form_is_read(tmp_path, form):
+    text, names, last = FORMS[form]
+    encoding = form.partition(", in ")[2] or "utf-8"
+    found = table(tmp_path, text, "drive.txt", encoding)
+    assert found.names == tuple(names.split(" "))
+    assert read_numbers(found, len(found.names) - 1).tolist() == last
 
 
 def test_labels_within_the_rows_name_the_columns(tmp_path):
@@ -67,13 +87,6 @@ def test_labels_within_the_rows_name_the_columns(tmp_path):
     assert read_numbers(found, "ticks[1]").tolist() == [4294859756.0] * 2
 
 
-def test_a_tum_trajectory_needs_no_header(tmp_path):
-    found = table(
-        tmp_path, "10.0 1 2 0 0 0 0.6 0.8\n10.1 1 2 0 0 0 0.6 0.8\n", "drive.txt"
-    )
-    assert found.names[:3] == ("timestamp", "tx", "ty")
-
-
 def test_flags_may_be_words_and_cells_empty(tmp_path):
     found = table(
         tmp_path, "t,on,mode,x\n0,True,AUTO,1\n1,False,MANUAL,\n2,True,AUTO,3\n"
@@ -81,11 +94,6 @@ def test_flags_may_be_words_and_cells_empty(tmp_path):
     assert read_numbers(found, "on").tolist() == [1.0, 0.0, 1.0]
     assert found.column("mode").tolist() == ["AUTO", "MANUAL", "AUTO"]
     assert np.isnan(read_numbers(found, "x")[1])
-
-
-def test_a_header_of_an_old_windows_tool_is_read(tmp_path):
-    found = table(tmp_path, "t;Winkel [°]\n0;1,5\n1;2,5\n", encoding="latin-1")
-    assert read_numbers(found, "Winkel [°]").tolist() == [1.5, 2.5]
 
 
 def test_a_row_that_was_cut_short_is_left_out_and_told(tmp_path):
@@ -128,31 +136,9 @@ def test_a_column_that_is_not_there_is_named(tmp_path, which, sentence):
     assert sentence in str(refused.value)
 
 
-@pytest.mark.parametrize("separator", ["~", ":", "&"])
-def test_an_odd_separator_is_found_if_no_usual_one_fits(tmp_path, separator):
-    found = table(tmp_path, "t x y\n0 1.5 2\n1 2.5 3\n".replace(" ", separator))
-    assert found.names == ("t", "x", "y")
-    assert read_numbers(found, "x").tolist() == [1.5, 2.5]
-
-
-def test_the_names_stand_above_a_row_of_units(tmp_path):
-    found = table(tmp_path, "Log of 2024-05-01, robot 3\nt,x,y\ns,m,m\n0,1,2\n1,2,3\n")
-    assert found.names == ("t", "x", "y")
-
-
-def test_numbers_with_decimal_commas_may_be_quoted(tmp_path):
-    found = table(tmp_path, 't,x\n"0,5","1,25"\n"0,6","1,75"\n')
-    assert read_numbers(found, "x").tolist() == [1.25, 1.75]
-
-
 @pytest.mark.parametrize("word", ["NA", "null", "None", "-", "nan", ""])
 def test_words_for_a_missing_value_are_none(tmp_path, word):
     assert np.isnan(read_numbers(table(tmp_path, f"t,x\n0,{word}\n1,2\n"), "x")[0])
-
-
-def test_excel_in_utf_16_and_comments_of_matlab_are_read(tmp_path):
-    assert table(tmp_path, "t\tx\n0\t1\n", encoding="utf-16").names == ("t", "x")
-    assert table(tmp_path, "% t, x\n0,1\n1,2\n").names == ("t", "x")
 
 
 def test_an_archive_that_unpacks_to_gigabytes_is_refused_packed(monkeypatch, tmp_path):

@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from steps import integrate
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.recording.textbook import record
@@ -13,24 +12,10 @@ from nics_drl_bridge.robot.spec import load_robot
 ROBOTS = ("ackermann", "differential", "mecanum")
 
 
-def steady(spec, command):
-    """The state that a command leads to in the end."""
-    return textbook(spec).target(np.array(command))
-
-
-@pytest.mark.parametrize("name", ["differential", "mecanum"])
-@pytest.mark.parametrize("share", [(1.0, 0.0), (0.0, 1.0), (0.3, -0.8)])
-def test_wheels_turn_so_that_the_body_moves_as_commanded(name, share):
-    spec = load_robot(name)
-    command = np.zeros(len(spec.command))
-    command[[0, -1]] = share
-    twist = textbook(spec).twist(steady(spec, command))
-    assert twist == pytest.approx(spec.to_cmd_vel(command), abs=1e-12)
-
-
 def test_mecanum_wheels_move_the_body_sideways():
     spec = load_robot("mecanum")
-    front_left, front_right, rear_left, rear_right = steady(spec, [0.0, 0.5, 0.0])
+    wheels = textbook(spec).target(np.array([0.0, 0.5, 0.0]))
+    front_left, front_right, rear_left, rear_right = wheels
     assert (
         -front_left
         == front_right
@@ -41,11 +26,14 @@ def test_mecanum_wheels_move_the_body_sideways():
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_the_motion_solves_the_differential_equation(name):
+@pytest.mark.parametrize("dt", [0.01, 0.025])
+def test_a_recorded_drive_solves_the_differential_equation(name, dt):
     spec = load_robot(name)
-    book, rng = textbook(spec), np.random.default_rng(0)
-    command = rng.uniform(spec.command_low, spec.command_high)
-    state = rng.uniform([v.min for v in spec.state], [v.max for v in spec.state]) / 3.0
+    book = textbook(spec)
+    drive = record(spec, np.random.default_rng(1), duration=1.0, dt=dt)
+    rows = np.concatenate([drive.pose.values, drive.state.values], axis=1)
+    row = round(0.5 / dt)  # at which the command changes
+    command = drive.command.values[row]
 
     def derivative(_, y):
         vx, vy, wz = book.twist(y[3:])
@@ -54,29 +42,11 @@ def test_the_motion_solves_the_differential_equation(name):
         rates = (book.target(command) - y[3:]) / book.lag
         return [c * vx - s * vy, s * vx + c * vy, wz, *rates]
 
-    start = np.array([0.4, -0.2, 1.0, *state])
-    solved = solve_ivp(derivative, (0.0, 0.8), start, rtol=1e-10, atol=1e-12).y[:, -1]
-    pose, end = integrate(book, start[:3], state, command, 0.8)
-    assert end == pytest.approx(solved[3:], rel=1e-8)
-    assert pose[:2] == pytest.approx(solved[:2], abs=1e-5)
-    assert geometry.wrap_angle(pose[2] - solved[2]) == pytest.approx(0.0, abs=1e-5)
-
-
-@pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.parametrize("dt", [0.01, 0.025])
-def test_a_recorded_drive_is_what_integration_gives_step_by_step(name, dt):
-    spec = load_robot(name)
-    book = textbook(spec)
-    drive = record(spec, np.random.default_rng(1), duration=2.0, dt=dt)
-    pose, state = integrate(
-        book,
-        drive.pose.values[:-1],
-        drive.state.values[:-1],
-        drive.command.values[:-1],
-        dt,
-    )
-    assert np.allclose(state, drive.state.values[1:], atol=1e-9)
-    assert np.abs(geometry.between(pose, drive.pose.values[1:])).max() < 1e-9
+    span = (0.0, 0.5 - dt)
+    solved = solve_ivp(derivative, span, rows[row], rtol=1e-10, atol=1e-12).y[:, -1]
+    off = rows[-1] - solved
+    off[2] = geometry.wrap_angle(off[2])
+    assert np.abs(off).max() < 1e-8
 
 
 def test_a_recorded_drive_holds_commands_within_limits_and_starts_at_rest():

@@ -59,6 +59,8 @@ def test_motion_capture_goes_before_odometry_and_none_takes_it_away():
     assert found["pose"] == "/mocap/car"
     assert "odom" not in found
     assert assign(TopicRoles(pose="none"), types, (), "drive")["odom"] == "/odom"
+    given = assign(TopicRoles(cmd_vel="x"), types | {"/x": kinds.TWIST}, (), "drive")
+    assert given["cmd_vel"] == "/x"
 
 
 def test_what_is_measured_is_no_command():
@@ -67,13 +69,6 @@ def test_what_is_measured_is_no_command():
     sentence = refused(types)
     assert "no topic is known to hold the commands" in sentence
     assert "for example with --topic cmd_vel=/vrpn_mocap/car/twist" in sentence
-
-
-def test_the_mapping_goes_before_the_names():
-    types = USUAL | {"/other": kinds.TWIST}
-    assert (
-        assign(TopicRoles(cmd_vel="other"), types, (), "drive")["cmd_vel"] == "/other"
-    )
 
 
 def test_several_topics_for_a_role_are_listed_with_what_to_write():
@@ -101,14 +96,9 @@ def test_without_poses_the_topics_are_listed_with_their_types():
     )
 
 
-def test_without_a_topic_of_a_fitting_type_the_types_are_listed():
-    assert "record one of type geometry_msgs/msg/Twist, " in refused(
-        {"/odom": kinds.ODOMETRY}
-    )
-
-
 def test_an_empty_topic_plays_no_role():
     sentence = refused(USUAL, empty=("/cmd_vel",))
+    assert "record one of type geometry_msgs/msg/Twist, " in sentence
     assert "which `nics inspect BAG --map my.yaml` begins" in sentence
     assert "no topic is known to hold the commands" in sentence
     assert "/cmd_vel (geometry_msgs/msg/Twist, empty)" in sentence
@@ -149,12 +139,11 @@ def test_the_options_go_before_the_file(tmp_path):
 
 def test_the_example_of_the_docs_is_a_mapping(tmp_path):
     page = Path(__file__).parents[2] / "docs" / "recordings.md"
-    (example,) = re.findall(
-        r"```yaml\n(cmd_vel.*?)```", page.read_text(encoding="utf-8"), re.DOTALL
-    )
-    file = tmp_path / "topics.yaml"
-    file.write_text(example, encoding="utf-8")
-    assert set(load_topic_roles(file).state) == {"speed", "steering"}
+    text = page.read_text(encoding="utf-8")
+    (example,) = re.findall(r"```yaml\n(cmd_vel.*?)```", text, re.DOTALL)
+    (tmp_path / "topics.yaml").write_text(example, encoding="utf-8")
+    roles = load_topic_roles(tmp_path / "topics.yaml")
+    assert set(roles.state) == {"speed", "steering"}
 
 
 @pytest.mark.parametrize(

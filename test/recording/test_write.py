@@ -65,12 +65,9 @@ def test_a_bag_that_could_not_be_finished_leaves_nothing(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["drive.npz", "drive", "new/drive"])
+@pytest.mark.parametrize("name", ["drive.npz", "new/drive"])
 def test_a_drive_comes_back_from_a_file_and_from_a_bag(tmp_path, name):
-    if not name.endswith(".npz"):
-        pytest.importorskip("rosbags")
-    drive = record(CAR, np.random.default_rng(0), duration=20.0)
+    drive = record(CAR, np.random.default_rng(0), duration=2.0)
     path = check_out(tmp_path / name)
     write_drive(drive, path, CAR)
     if path.suffix == ".npz":  # which tells its robot, too

@@ -9,11 +9,20 @@ import pytest
 from nics_drl_bridge import generator
 from nics_drl_bridge.identify.hypotheses import Base, Draft
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.report import format_report, format_with_error
+from nics_drl_bridge.identify.report import (
+    collect_estimates,
+    format_report,
+    format_with_error,
+)
 from nics_drl_bridge.identify.terms import Kind, Library
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report.fit_page import fit_tile, write_fit_page
-from nics_drl_bridge.report.fit_pictures import fit_pictures, write_pictures
+from nics_drl_bridge.report.fit_pictures import (
+    draw_inputs,
+    fit_pictures,
+    write_pictures,
+)
+from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.robot.taylor import EndErrors
 
@@ -124,3 +133,59 @@ def test_of_what_predictions_chose_only_the_pruning_is_told(found):
 )
 def test_a_number_has_the_digits_that_its_error_leaves(value, error, text):
     assert format_with_error(value, error) == text
+
+
+def test_estimates_are_told_with_their_uncertainty_or_why_there_is_none(found):
+    _, identified = found
+    text = format_report("here", identified)
+    for part in (
+        "clock offset: not estimated, pose and commands are on one clock",
+        "period of bursts: not estimated, the poses are stamped one by one",
+        "wheel scale: not estimated, no wheel speeds were recorded",
+    ):
+        assert part in text
+    sigma = {"clock_offset_s": 0.0104, "lever_arm_x_m": 0.004, "lever_arm_y_m": 0.01}
+    calibration = replace(
+        identified.calibration,
+        clock_offset_s=-3.0012,
+        lever_arm_m=(0.1, 0.0),
+        burst_period_s=0.1,
+        wheels_swapped=True,
+        uncertainty=sigma,
+    )
+    told = collect_estimates(replace(identified, calibration=calibration))
+    for name, text in {
+        "clock_offset_s": "clock offset -3.001 +- 0.01 s",
+        "lever_arm_x_m": "lever arm x 0.1 +- 0.004 m",
+        "lever_arm_y_m": "lever arm y 0 +- 0.01 m (below its uncertainty: taken as zero)",
+        "burst_period_s": "period of bursts 0.1 s",
+        "wheels_swapped": "swapped wheels: left and right are interchanged",
+    }.items():
+        assert told[name].text == text
+
+
+def test_motors_are_drawn_and_reported_with_what_is_known_of_them(found):
+    spec, identified = found
+    assert draw_inputs(spec, identified) is None
+    assert "Effect of the motors" not in format_report("drive", identified)
+    name = spec.command[0].name
+    state = spec.state[0].name
+    size = len(spec.state)
+    curve = InputCurve(command=name, dead=0.12, least=-0.5, most=0.8, back=0.6)
+    friction = np.zeros(size)
+    limits = np.tile([-np.inf, np.inf], (size, 1))
+    friction[0] = 0.2
+    limits[0] = (-3.0, 2.0)
+    model = replace(identified.model, inputs=(curve,), friction=friction, limits=limits)
+    sigma = {f"{name}.dead": 0.004}
+    calibration = replace(identified.calibration, uncertainty=sigma)
+    motors = replace(identified, model=model, calibration=calibration)
+    report = format_report("drive", motors)
+    for part in (
+        f"{name}' = 0 within +-0.12, else {name} -+ 0.12",
+        ", at least -3, at most 2, less dry friction of 0.2  [rad/s/s]",
+        f"{name:<24} dead zone on both sides of 0: 0.12 +- 0.004",
+        f"{state:<24} dry friction: 0.2 rad/s/s",
+    ):
+        assert part in report
+    assert draw_inputs(spec, motors).startswith(PNG)

@@ -28,20 +28,19 @@ from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import build_robot
 from nics_drl_bridge.robot.taylor import TaylorModel, list_exponents
 
-SHIPPED = ("ackermann", "differential", "jackal", "mecanum", "tricycle")
-WHEELS = {"differential": 0.05, "jackal": 0.098, "mecanum": 0.05}
+WHEELED = ("differential", "jackal", "mecanum")
 SHARES = (1.0, 0.83, 0.707, 0.55, 0.31, 0.17)
 OWN = parse_yaml(
     """
-    tricycle:
+    lorry:
       kind: tricycle
       footprint: [[0.9, 0.3], [0.9, -0.3], [-0.3, -0.4], [-0.3, 0.4]]
       parameters: {wheelbase: 0.8, speed_lag: 0.4}
       command:
         - {name: speed_command, min: -0.6, max: 1.5}
         - {name: steering_command, min: -0.7, max: 0.7}
-    mecanum: {kind: mecanum, footprint_radius: 0.4, parameters: {wheel_lag: 0.3}}
-    skid_steer:
+    wagon: {kind: mecanum, footprint_radius: 0.4, parameters: {wheel_lag: 0.3}}
+    husky:
       kind: skid_steer
       footprint: [[0.5, 0.34], [-0.5, 0.34], [-0.5, -0.34], [0.5, -0.34]]
       parameters: {wheel_lag: 0.25}
@@ -51,17 +50,14 @@ OWN = parse_yaml(
 
 
 @cache
-def own(name):
-    """A robot that a YAML file alone describes, and its model."""
-    robot = build_robot({"name": f"own_{name}", **OWN[name]})
+def known(name):
+    """A robot that is shipped, or that a YAML file alone describes, and its model."""
+    if name not in OWN:
+        model = builtin_model(name)
+        return model.robot, model.kinematics
+    robot = build_robot({"name": name, **OWN[name]})
     drive = textbook.record(robot, np.random.default_rng(0))
     return robot, identify(drive, robot).model
-
-
-@cache
-def shipped(name):
-    model = builtin_model(name)
-    return model.robot, model.kinematics
 
 
 def limited(model, rate):
@@ -145,40 +141,34 @@ def direction_of(robot, command):
     return along / np.hypot(*along)
 
 
-@pytest.mark.parametrize("name", SHIPPED)
-@pytest.mark.slow
-def test_the_bound_of_a_shipped_robot_is_above_its_stops_and_not_far_above(name):
-    robot, model = shipped(name)
-    assert_bounds(robot, model)
-
-
 @pytest.mark.parametrize(
-    ("name", "at_the_rim"),
-    [("differential", 0.2), ("jackal", 0.6), ("mecanum", 0.2)],
+    ("name", "rate"),
+    [
+        ("ackermann", None),
+        ("differential", None),
+        ("jackal", None),
+        ("mecanum", None),
+        ("tricycle", None),
+        ("differential", 4.0),  # wheels that brake weakly [rad/s^2]
+        ("jackal", 6.1),
+        ("mecanum", 4.0),
+        ("lorry", None),
+        ("lorry", 3.0),
+        ("wagon", 3.0),
+        ("husky", None),
+    ],
 )
 @pytest.mark.slow
-def test_so_is_that_of_wheels_that_brake_weakly(name, at_the_rim):
-    robot, model = shipped(name)
-    weak = limited(model, at_the_rim / WHEELS[name])
-    assert_bounds(robot, weak)
+def test_the_bound_is_above_the_stops_of_a_robot_and_not_far_above(name, rate):
+    robot, model = known(name)
+    assert_bounds(robot, model if rate is None else limited(model, rate))
 
 
 def test_a_jackal_whose_wheels_brake_by_0_2_needs_two_and_a_half_metres_from_1_m_s():
-    robot, model = shipped("jackal")
+    robot, model = known("jackal")
     weak = limited(model, 0.2 / 0.098)
     assert 2.4 < find_braking(robot, weak).distance(1.0) < 2.7
     assert find_braking(robot, model).distance(1.0) == pytest.approx(0.2, abs=0.01)
-
-
-@pytest.mark.parametrize(
-    ("name", "rate"),
-    [("tricycle", None), ("tricycle", 3.0), ("mecanum", 3.0), ("skid_steer", None)],
-)
-@pytest.mark.slow
-def test_so_is_that_of_a_robot_that_yaml_alone_describes(name, rate):
-    robot, model = own(name)
-    model = model if rate is None else limited(model, rate)
-    assert_bounds(robot, model)
 
 
 def throttle_car(pull=2.0, decay=0.5, bias=0.0, **changes):
@@ -239,21 +229,14 @@ def test_so_is_that_of_a_car_with_a_throttle(changes):
 
 def test_a_turn_that_ends_later_is_counted():
     """Wheels that brake weakly stop one after the other: the whole footprint is bounded."""
-    robot, model = shipped("jackal")
+    robot, model = known("jackal")
     weak = limited(model, 0.2 / 0.098)
     braking = find_braking(robot, weak)
     radius = robot.footprint_radius
-    commands = [
-        [2.0, 2.5],
-        [1.0, -1.5],
-        [0.4, 2.0],
-        [-0.5, 2.5],
-        [0.0, 2.5],
-        [1.5, 0.4],
-    ]
-    for speed, turn, path, turned in zip(
-        *run_stops(weak, np.array(commands)), strict=True
-    ):
+    ahead = [2.0, 1.0, 0.4, -0.5, 0.0, 1.5]
+    turns = [2.5, -1.5, 2.0, 2.5, 2.5, 0.4]
+    stops = run_stops(weak, np.stack([ahead, turns], axis=1))
+    for speed, turn, path, turned in zip(*stops, strict=True):
         pace = max(braking.pace(np.array([speed, 0.0, turn])), radius * turn)
         duration = braking.reaction_s + pace / (2.0 * braking.deceleration)
         assert (speed + radius * turn) * duration >= path + radius * turned - 5e-3
@@ -285,31 +268,23 @@ def test_a_turn_that_ends_apart_from_the_speed_makes_no_mixture_look_slow():
                 assert turns <= 1.3 * turned + 0.05
 
 
-def test_a_mixture_takes_as_long_as_the_slower_of_its_parts():
-    turn = TurnBraking(reaction_s=0.4, deceleration=2.0)
-    braking = Braking(0.2, 0.5, turn=turn)
-    assert braking.time_s(np.array([1.0, 0.0, 0.0])) == pytest.approx(2.2)
-    assert braking.time_s(np.array([0.1, 0.0, 2.0])) == pytest.approx(1.4)
-    assert braking.mean_time_s(np.array([0.1, 0.0, 2.0])) == pytest.approx(0.9)
-
-
 def test_a_robot_that_stays_on_its_arc_has_no_drift():
-    for name in WHEELS:
-        braking = find_braking(*shipped(name))
+    for name in WHEELED:
+        braking = find_braking(*known(name))
         assert braking.drift == Drift()
         assert braking.lever_m == 0.0
         assert braking.turn is None
 
 
 def test_a_ramp_of_the_commands_is_added():
-    robot, model = shipped("differential")
+    robot, model = known("differential")
     braking = find_braking(robot, model, ramp=np.array([0.5, np.inf]))
     assert braking.deceleration == pytest.approx(0.5, rel=0.01)
     assert braking.reaction_s == pytest.approx(0.1, abs=2e-3)
 
 
 def test_delays_of_commands_are_added():
-    robot, model = shipped("differential")
+    robot, model = known("differential")
     late = replace(model, inputs=(InputCurve(command="forward_command", delay=0.25),))
     sooner = find_braking(robot, model).reaction_s
     assert find_braking(robot, late).reaction_s == pytest.approx(
@@ -361,9 +336,14 @@ def test_time_and_distance_are_those_of_even_braking_after_the_reaction():
     assert braking.time_s(np.array([1.0, 0.0, 0.0])) == pytest.approx(2.2)
     assert braking.distance(1.0) == pytest.approx(1.2)
     assert braking.time_s(np.array([-1.0, 0.0, -5.0])) == pytest.approx(3.2)
-    assert replace(braking, order=1.0).pace(
-        np.array([0.5, -0.25, 0.0])
-    ) == pytest.approx(0.75)
+    diagonal = np.array([0.5, -0.25, 0.0])
+    assert replace(braking, order=1.0).pace(diagonal) == pytest.approx(0.75)
+    turn = TurnBraking(reaction_s=0.4, deceleration=2.0)
+    braking = Braking(0.2, 0.5, turn=turn)
+    straight, mixed = np.array([1.0, 0.0, 0.0]), np.array([0.1, 0.0, 2.0])
+    assert braking.time_s(straight) == pytest.approx(2.2)
+    assert braking.time_s(mixed) == pytest.approx(1.4)  # of its slower part
+    assert braking.mean_time_s(mixed) == pytest.approx(0.9)
 
 
 def test_no_share_of_a_bound_of_zero_is_taken():

@@ -10,14 +10,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from robots import lidar
-from steps import integrate
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.config import validate
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.task import discrete_commands
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.extras.physics.machines import Physics, design_machine
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import generate
 from nics_drl_bridge.policy.policies import make_policy
@@ -106,13 +104,12 @@ def test_the_spec_tells_what_its_commands_mean(name, steers, moves_sideways, tur
     assert all(command.is_twist for command in robot.command) == (not steers)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", [*SHIPPED, "jackal"])
 def test_a_held_command_leads_to_its_steady_twist(name):
     robot = load_robot(name)
     book = textbook(robot)
     command = 0.6 * robot.command_high
-    _, state = integrate(book, np.zeros(3), np.zeros(len(robot.state)), command, 5.0)
+    state = book.respond(np.zeros(len(book.lag)), book.target(command), 5.0)
     assert compute_steady_twist(robot, command) == pytest.approx(
         book.twist(state), abs=1e-9
     )
@@ -138,13 +135,12 @@ def test_the_command_for_a_twist_leads_to_it(kind):
 
 
 @pytest.mark.parametrize("kind", KNOWN)
-@pytest.mark.slow
 def test_a_robot_known_by_its_twist_comes_to_that_of_its_actuators(kind):
     robot = made(kind)
     command = 0.6 * robot.command_high
-    start = np.zeros(len(textbook(robot).lag))
-    _, state = integrate(textbook(robot), np.zeros(3), start, command, 5.0)
-    assert textbook(robot).twist(state) == pytest.approx(
+    book = textbook(robot)
+    state = book.respond(np.zeros(len(book.lag)), book.target(command), 5.0)
+    assert book.twist(state) == pytest.approx(
         compute_steady_twist(robot, command), abs=1e-3
     )
 
@@ -214,7 +210,6 @@ def successes(env, policy):
 
 
 GENERATED = {
-    "throttle": made("ackermann_throttle"),
     "wheels": made("differential_wheels"),
     "of a guessed wheelbase": made("ackermann"),
     NEW: load_robot(NEW),
@@ -223,7 +218,7 @@ GENERATED = {
 
 @pytest.fixture(scope="module", params=GENERATED)
 def model(request):
-    """A robot, generated from a drive of its own; two have no field of cmd_vel."""
+    """A robot, generated from a drive of its own; one has no field of cmd_vel."""
     robot = GENERATED[request.param]
     drive = record(robot, np.random.default_rng(0), duration=30.0)
     return generate(drive, robot, lidar(), ())[0]
@@ -255,17 +250,17 @@ def test_a_model_moves_as_its_kind_and_drives_in_an_env_to_goals(model):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["straight", "dynamic_window"])
-def test_a_free_robot_reaches_goals_by_its_model_and_not_without(name):
+def test_a_free_robot_reaches_goals_by_its_model_and_not_without():
     car = made("ackermann_throttle")
     ranges = {c.name: (c.min, c.max) for c in car.command}
     robot = build_robot({"kind": "free", "footprint_radius": 0.2}, ranges)
     model = generate(record(car, np.random.default_rng(0)), robot, lidar(), ())[0]
     env = BridgeEnv(model=model, world="empty")
-    assert successes(env, make_policy(name, env.task, model)) == 2
-    observation, _ = env.reset(seed=0)
-    with pytest.raises(ConfigError, match="has no textbook kinematics"):
-        make_policy(name, env.task).act(observation)
+    for name in ("straight", "dynamic_window"):
+        assert successes(env, make_policy(name, env.task, model)) == 2
+        observation, _ = env.reset(seed=0)
+        with pytest.raises(ConfigError, match="has no textbook kinematics"):
+            make_policy(name, env.task).act(observation)
 
 
 def test_their_discrete_actions_drive_ahead_and_turn():
@@ -304,13 +299,6 @@ def test_it_has_limits_and_is_drawn_on_three_wheels():
     (steering,) = [j for j in root.iter("joint") if j.attrib["type"] == "revolute"]
     assert steering.attrib["name"] == "steering"
     assert steering.find("mimic") is None
-
-
-def test_mujoco_says_that_it_has_no_machine_of_it():
-    with pytest.raises(
-        ConfigError, match="'tricycle': MuJoCo has no machine of the kind 'tricycl"
-    ):
-        design_machine(load_robot(NEW), Physics(), "MuJoCo")
 
 
 @pytest.mark.parametrize("name", ["tank", "mecanum"])

@@ -39,6 +39,7 @@ def model():
 def test_rates_are_the_coefficients_times_the_terms(model):
     assert np.allclose(model.rates([0.5, 2.0]), [1.0, 0.0, -1.0, 4.5])
     assert model.rates(np.ones((3, 4, 2))).shape == (3, 4, 4)
+    assert (model.state_size, model.terms_kept) == (1, 4)
 
 
 def test_a_step_follows_the_arc_and_adds_to_the_state(model):
@@ -46,11 +47,6 @@ def test_a_step_follows_the_arc_and_adds_to_the_state(model):
     expected = geometry.compose([1.0, 2.0, 0.5], geometry.exp([0.1, 0.0, -0.1]))
     assert np.allclose(pose, expected)
     assert np.allclose(state, [0.95])
-
-
-def test_sizes_are_counted(model):
-    assert model.state_size == 1
-    assert model.terms_kept == 4
 
 
 def test_the_equations_read_as_formulas_with_units(model):
@@ -100,30 +96,19 @@ def test_a_missing_key_is_named(model, key):
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        (["dt"], "fast"),
         (["dt"], 0.0),
-        (["dt"], -0.1),
         (["dt"], float("nan")),
         (["dt"], float("inf")),
-        (["terms"], [1, 2]),
         (["terms", "vx"], None),
-        (["terms", "vx", "s"], "much"),
+        (["terms", "vx", "s"], True),
         (["terms", "vx", "s"], float("nan")),
         (["terms", "vx", "ghost"], 1.0),
         (["terms", "vx", "s^-1"], 1.0),
         (["terms", "vx", f"s^{10**30}"], 1.0),
-        (["terms", "vx", "s"], "2.0"),
-        (["terms", "vx", "s"], True),
         (["colour"], "red"),
         (["units", "wz"], KeyError),
-        (["valid", "s"], [0.0]),
-        (["valid", "s"], [0.0, 1.0, 2.0]),
-        (["valid", "s"], "wide"),
         (["valid"], {"s": [0.0], "c": [1.0]}),
-        (["valid"], {"s": 0.0, "c": 1.0}),
-        (["valid"], 3),
         (["assumed"], [["wz"]]),
-        (["assumed"], 3),
     ],
 )
 def test_what_is_wrong_is_one_sentence(model, path, value):
@@ -136,17 +121,15 @@ NAMES = ("speed", "steering", "push")
 
 @pytest.mark.parametrize("variables", [1, 2, 4, 7])
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
-def test_every_product_stands_once(variables, order):
+def test_every_product_stands_once_the_constant_first_by_order(variables, order):
     powers = list_exponents(variables, order)
     assert powers.shape == (comb(variables + order, order), variables)
     assert len({tuple(row) for row in powers}) == len(powers)
-    assert (powers.sum(axis=1) <= order).all()
-
-
-def test_the_constant_comes_first_and_orders_ascend():
-    powers = list_exponents(3, 3)
-    assert not powers[0].any()
+    assert powers[0].sum() == 0
     assert (np.diff(powers.sum(axis=1)) >= 0).all()
+    assert powers[-1].sum() == order
+    shuffled = np.random.default_rng(2).permutation(powers)
+    assert np.array_equal(sorted(shuffled, key=make_sort_key), powers)
 
 
 def test_the_features_are_the_distinct_entries_of_the_kronecker_product():
@@ -169,34 +152,15 @@ def test_each_term_has_a_name_of_its_own_that_reads_back():
     powers = list_exponents(3, 3)
     names = [format_term(row, NAMES) for row in powers]
     assert len(set(names)) == len(names)
+    assert names[0] == "1"
+    assert "speed*push^2" in names
     for name, row in zip(names, powers, strict=True):
         assert np.array_equal(parse_term(name, NAMES), row)
 
 
-def test_names_read_as_formulas():
-    assert format_term(np.array([0, 0, 0]), NAMES) == "1"
-    assert format_term(np.array([1, 0, 2]), NAMES) == "speed*push^2"
-
-
 @pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "nonsense",
-        "speed*",
-        "speed^x",
-        "speed^-1",
-        "speed^0.5",
-        "speed^0",
-        "2*speed",
-    ],
+    "text", ["", "nonsense", "speed*", "speed^x", "speed^0", "speed^0.5", "2*speed"]
 )
 def test_what_is_no_term_is_refused(text):
     with pytest.raises(ValueError, match=r"term|literal"):
         parse_term(text, NAMES)
-
-
-def test_terms_sort_as_they_are_listed():
-    powers = [tuple(row) for row in list_exponents(3, 3)]
-    shuffled = np.random.default_rng(2).permutation(np.array(powers))
-    assert [tuple(row) for row in sorted(shuffled, key=make_sort_key)] == powers

@@ -96,33 +96,26 @@ def test_wheels_stand_on_the_ground_and_move_as_joint_states_says(name: str) -> 
     assert all(joint.find("axis").attrib["xyz"] == "0 1 0" for joint in turning)
 
 
-def test_a_differential_robot_has_its_track_and_its_left_wheel_at_positive_y() -> None:
-    text = make_urdf(load_robot("differential"))
-    assert place(text, "left_wheel_link") == pytest.approx([0.0, 0.1, 0.05])
-    assert place(text, "right_wheel_link") == pytest.approx([0.0, -0.1, 0.05])
+@pytest.mark.parametrize(
+    ("name", "link", "at"),
+    [
+        ("differential", "left_wheel_link", [0.0, 0.1, 0.05]),
+        ("differential", "right_wheel_link", [0.0, -0.1, 0.05]),
+        ("mecanum", "front_left_wheel_link", [0.1, 0.1, 0.05]),
+        ("mecanum", "rear_right_wheel_link", [-0.1, -0.1, 0.05]),
+        # A jackal stands on its wheels, not on the track of its drive.
+        ("jackal", "front_left_wheel_link", [0.131, 0.188, 0.098]),
+        ("jackal", "rear_right_wheel_link", [-0.131, -0.188, 0.098]),
+        ("ackermann", "front_left_wheel_link", [0.2, 0.08, 0.036]),
+        ("ackermann", "rear_left_wheel_link", [0.0, 0.08, 0.036]),
+    ],
+)
+def test_a_wheel_stands_where_the_parameters_say(name, link, at) -> None:
+    assert place(make_urdf(load_robot(name)), link) == pytest.approx(at)
 
 
-def test_a_mecanum_robot_has_four_wheels_in_the_order_of_its_state() -> None:
-    text = make_urdf(load_robot("mecanum"))
-    assert place(text, "front_left_wheel_link") == pytest.approx([0.1, 0.1, 0.05])
-    assert place(text, "rear_right_wheel_link") == pytest.approx([-0.1, -0.1, 0.05])
-    assert set(wheels(text).values()) == {0.05}
-
-
-def test_a_jackal_stands_on_its_wheels_not_on_the_track_of_its_drive() -> None:
-    text = make_urdf(load_robot("jackal"))
-    assert place(text, "front_left_wheel_link") == pytest.approx([0.131, 0.188, 0.098])
-    assert place(text, "rear_right_wheel_link") == pytest.approx(
-        [-0.131, -0.188, 0.098]
-    )
-
-
-def test_a_car_has_its_wheelbase_and_steers_within_its_limits() -> None:
-    spec = load_robot("ackermann")
-    text = make_urdf(spec)
-    gap = place(text, "front_left_wheel_link") - place(text, "rear_left_wheel_link")
-    assert gap == pytest.approx([spec.parameters["wheelbase"], 0.0, 0.0])
-    limit = joints(text)["steering"].find("limit").attrib
+def test_a_car_steers_within_its_limits() -> None:
+    limit = joints(make_urdf(load_robot("ackermann")))["steering"].find("limit").attrib
     assert (float(limit["lower"]), float(limit["upper"])) == (-0.5, 0.5)
 
 

@@ -50,11 +50,11 @@ def test_a_trail_begins_anew_with_each_episode_and_never_grows_without_end():
     trail = Track()
     for step in range(3 * Track.MOST):
         trail.add(np.array([[step * 0.01, 0.0, 0.0]]), step)
-    (way,) = trail.ways
-    assert len(way) <= Track.MOST
-    assert way[-1, 0] == pytest.approx(0.01 * (3 * Track.MOST - 1))
+    (path,) = trail.paths
+    assert len(path) <= Track.MOST
+    assert path[-1, 0] == pytest.approx(0.01 * (3 * Track.MOST - 1))
     trail.add(np.zeros((1, 3)), 0)
-    assert len(trail.ways[0]) == 1
+    assert len(trail.paths[0]) == 1
 
 
 def test_a_stage_tells_all_that_is_drawn_once():
