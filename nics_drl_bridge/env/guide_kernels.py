@@ -70,31 +70,30 @@ def find_ways(
 
     For the worlds (n,): member (n,), bodies (n, K, 7), goals (n, M, 2).
     """
-    gaps = np.empty((grid.walls.shape[1], grid.walls.shape[2]), np.float32)
+    rows = grid.walls.shape[1]
+    columns = grid.walls.shape[2]
+    gaps = np.empty((rows, columns), np.float32)
     for n in range(len(worlds)):
         p = member[n]
-        frame = grid.frames[p]
         height = grid.sizes[p, 0]
         width = grid.sizes[p, 1]
         space = gaps[:height, :width]
         space[...] = grid.walls[p, :height, :width]
+        x = grid.frames[p, 0]
+        y = grid.frames[p, 1]
+        cell = grid.frames[p, 2]
         for k in range(bodies.shape[1]):
             if grid.stands[p, k] and bodies[n, k, RADIUS] > 0.0:
-                _lower_space(space, bodies[n, k], frame[0], frame[1], frame[2], grid)
-        _price_cells(space, frame[2], grid)
+                _lower_space(space, bodies[n, k], x, y, cell, grid)
+        for i in range(height):
+            for j in range(width):
+                cost = _find_cost(space[i, j], grid)
+                space[i, j] = np.float32(cell * cost)
         for m in range(goals.shape[1]):
             field = out[worlds[n], m, :height, :width]
-            u = (goals[n, m, 0] - frame[0]) / frame[2] - 0.5
-            v = (goals[n, m, 1] - frame[1]) / frame[2] - 0.5
+            u = (goals[n, m, 0] - x) / cell - 0.5
+            v = (goals[n, m, 1] - y) / cell - 0.5
             _spread(field, space, u, v)
-
-
-@kernel(inline=True)
-def _price_cells(space: Singles, cell: float, grid: GuideGrid) -> None:
-    """Replace the clearance (rows, columns) of cells by the cost of crossing them."""
-    for i in range(len(space)):
-        for j in range(space.shape[1]):
-            space[i, j] = np.float32(cell * _find_cost(space[i, j], grid))
 
 
 @kernel
@@ -117,20 +116,13 @@ def _lower_space(
         dy = y + (i + 0.5) * cell - body[Y]
         for j in range(left, right + 1):
             dx = x + (j + 0.5) * cell - body[X]
-            gap = _measure_gap(dx, dy, body, outline)
+            if outline.begin < outline.end:
+                along = body[COS] * dx + body[SIN] * dy
+                across = body[COS] * dy - body[SIN] * dx
+                gap = collision.outline_point(along, across, outline)
+            else:
+                gap = math.sqrt(dx * dx + dy * dy) - body[RADIUS]
             space[i, j] = min(space[i, j], np.float32(gap))
-
-
-@kernel(inline=True)
-def _measure_gap(
-    dx: float, dy: float, body: Array, outline: collision.Outline
-) -> float:
-    """Signed distance from a body, of a point at (dx, dy) from its origin [m]."""
-    if outline.begin == outline.end:
-        return math.sqrt(dx * dx + dy * dy) - body[RADIUS]
-    along = body[COS] * dx + body[SIN] * dy
-    across = body[COS] * dy - body[SIN] * dx
-    return collision.outline_point(along, across, outline)
 
 
 @kernel
@@ -178,26 +170,26 @@ def update_ways(ways: Singles, prices: Singles, down: bool, left: bool) -> np.fl
         i = rows - 1 - a if down else a
         for b in range(columns):
             j = columns - 1 - b if left else b
-            beside = min(ways[i, max(j - 1, 0)], ways[i, min(j + 1, columns - 1)])
-            above = min(ways[max(i - 1, 0), j], ways[min(i + 1, rows - 1), j])
-            if not min(beside, above) < ways[i, j]:
+            left_way = ways[i, max(j - 1, 0)]
+            right_way = ways[i, min(j + 1, columns - 1)]
+            below = ways[max(i - 1, 0), j]
+            over = ways[min(i + 1, rows - 1), j]
+            beside = min(left_way, right_way)
+            above = min(below, over)
+            price = prices[i, j]
+            apart = beside - above
+            least = min(beside, above)
+            if not least < ways[i, j]:
                 continue
-            way = _cross(beside, above, prices[i, j])
+            way = least + price
+            if abs(apart) < price:
+                square = np.float32(2.0) * price * price - apart * apart
+                way = np.float32(0.5) * (beside + above + math.sqrt(square))
             if way < ways[i, j]:
                 change = min(ways[i, j] - way, np.float32(1e3))
                 most = max(most, change)
                 ways[i, j] = way
     return most
-
-
-@kernel(inline=True)
-def _cross(beside: np.float32, above: np.float32, price: np.float32) -> np.float32:
-    """Return the path length behind a cell, given those before it in a row and a column."""
-    apart = beside - above
-    if abs(apart) < price:
-        square = np.float32(2.0) * price * price - apart * apart
-        return np.float32(np.float32(0.5) * (beside + above + math.sqrt(square)))
-    return np.float32(min(beside, above) + price)
 
 
 @kernel
@@ -221,16 +213,12 @@ def measure_lengths(
             v = (poses[n, m, 1] - y) / cell - 0.5
             u = min(max(u, 0.0), columns - 1.000001)
             v = min(max(v, 0.0), rows - 1.000001)
-            out[n, m] = _interpolate(fields[n, m], u, v)
-
-
-@kernel(inline=True)
-def _interpolate(field: Singles, u: float, v: float) -> float:
-    """Interpolate linearly at column u, row v, which lie between the outermost cells."""
-    i = int(v)
-    j = int(u)
-    s = v - i
-    t = u - j
-    below = (1.0 - t) * field[i, j] + t * field[i, j + 1]
-    above = (1.0 - t) * field[i + 1, j] + t * field[i + 1, j + 1]
-    return (1.0 - s) * below + s * above
+            i = int(v)
+            j = int(u)
+            s = v - i
+            t = u - j
+            row = fields[n, m, i]
+            next_row = fields[n, m, i + 1]
+            below = (1.0 - t) * row[j] + t * row[j + 1]
+            above = (1.0 - t) * next_row[j] + t * next_row[j + 1]
+            out[n, m] = (1.0 - s) * below + s * above

@@ -13,7 +13,7 @@ import numpy as np
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers, Singles
+from nics_drl_bridge.lidar.arrays import Array, Integers, Singles
 
 # Columns of a row of faults; `faults.LidarFaults` explains them.
 NOISE_STD, NOISE_PROPORTIONAL, DROPOUT, DROPOUT_FAR, TOO_CLOSE, QUANTISATION, SKEW = (
@@ -64,7 +64,12 @@ def distort(
     noisy = device.std > 0.0 or device.grows > 0.0
     coarse = device.step > 0.0 and device.first <= device.last
     if faults[TOO_CLOSE] == AS_GHOST:
-        _put_ghosts(whole, device, random.key(seed, random.GHOST_STREAM, counter))
+        by = random.key(seed, random.GHOST_STREAM, counter)
+        width = device.most - device.least
+        for i in range(len(ranges)):
+            ghost = device.least + random.share_of(random.bits(by, i)) * width
+            value = np.float32(ghost).view(np.int32)
+            whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
     if faults[TOO_CLOSE] == AS_RANGE_MIN or not (
         noisy or coarse or device.close == -np.inf
     ):
@@ -82,30 +87,12 @@ def distort(
             ranges[i] = _report(ranges[i], _quantize(ranges[i], device), device)
     if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
         by = random.key(seed, random.DROPOUT_STREAM, counter)
-        _lose_returns(ranges, whole, limits[1], faults, by)
-
-
-@kernel(inline=True)
-def _put_ghosts(whole: ShortIntegers, device: Distortion, by: int) -> None:
-    """Put random ranges in place of those that are too close, given the bits of ranges."""
-    width = device.most - device.least
-    for i in range(len(whole)):
-        ghost = device.least + random.share_of(random.bits(by, i)) * width
-        value = np.float32(ghost).view(np.int32)
-        whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
-
-
-@kernel(inline=True)
-def _lose_returns(
-    ranges: Singles, whole: ShortIntegers, range_max: float, faults: Array, by: int
-) -> None:
-    """Lose returns at random, more of them the farther away; `whole` are the bits of ranges."""
-    share = np.float32(faults[DROPOUT])
-    far = np.float32(faults[DROPOUT_FAR] / (range_max * range_max))
-    for i in range(len(ranges)):
-        reach = ranges[i] if ranges[i] > np.float32(0.0) else np.float32(0.0)
-        lost = random.share_of(random.bits(by, i)) < share + far * reach * reach
-        whole[i] = max(whole[i], INF if lost else NONE)
+        share = np.float32(faults[DROPOUT])
+        far = np.float32(faults[DROPOUT_FAR] / (limits[1] * limits[1]))
+        for i in range(len(ranges)):
+            reach = ranges[i] if ranges[i] > np.float32(0.0) else np.float32(0.0)
+            lost = random.share_of(random.bits(by, i)) < share + far * reach * reach
+            whole[i] = max(whole[i], INF if lost else NONE)
 
 
 @kernel(inline=True)

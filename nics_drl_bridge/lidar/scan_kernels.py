@@ -170,16 +170,10 @@ def scan_robot(
             scratch.singles,
             scratch.integers,
         )
-    _limit_ranges(ranges, scan.view(np.float32), lidar.range_min, lidar.range_max)
-
-
-@kernel(inline=True)
-def _limit_ranges(
-    ranges: Singles, distances: Singles, range_min: float, range_max: float
-) -> None:
-    """Write distances (B,) as ranges: too far becomes `inf`, too close `-inf` (REP-117)."""
-    low = np.float32(range_min)
-    high = np.float32(range_max)
+    # Ranges that are too far become `inf`, those too close `-inf` (REP-117).
+    low = np.float32(lidar.range_min)
+    high = np.float32(lidar.range_max)
+    distances = scan.view(np.float32)
     for b in range(len(ranges)):
         beam = np.uintp(b)
         value = distances[beam]

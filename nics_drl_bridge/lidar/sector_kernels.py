@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.arrays import Array, Mask, ShortIntegers, Singles
+from nics_drl_bridge.lidar.arrays import Array, ShortIntegers, Singles
 
 TURN = 2.0 * math.pi
 INF, UNKNOWN = np.array([np.inf, np.nan], np.float32).view(np.int32)
@@ -78,26 +78,19 @@ def _fill_by_place(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
         after = b + 1
         if after == beams:
             after = 0
-        if where[b] >= 0 and where[after] >= 0:
-            near = min(value[b], value[after])
-            _fill_between(out, where[b], where[after], near, has_return, around)
-
-
-@kernel(inline=True)
-def _fill_between(
-    out: Singles, first: int, last: int, near: float, has_return: Mask, around: int
-) -> None:
-    """Fill the sectors without a return between those of two beams, the shorter way round."""
-    gap = (last - first) % around
-    step = 1
-    if gap > around // 2:  # the other direction is shorter
-        step = -1
-        gap = around - gap
-    s = first
-    for _ in range(gap - 1):
-        s = (s + step) % around
-        if s < len(out) and not has_return[s]:
-            out[s] = _choose_nearer(out[s], near)
+        if where[b] < 0 or where[after] < 0:
+            continue
+        gap = (where[after] - where[b]) % around
+        step = 1
+        if gap > around // 2:  # the other direction is shorter
+            step = -1
+            gap = around - gap
+        near = min(value[b], value[after])
+        s = where[b]
+        for _ in range(gap - 1):
+            s = (s + step) % around
+            if s < sectors and not has_return[s]:
+                out[s] = _choose_nearer(out[s], near)
 
 
 @kernel

@@ -82,6 +82,7 @@ def find_near(
     cells: BodyCells,
 ) -> int:
     """Return flags for what robot m of world n may touch; write row m of `near`."""
+    walls = scene.walls
     me = bodies.shape[1] - len(near) + m
     x = bodies[n, me, X]
     y = bodies[n, me, Y]
@@ -95,34 +96,26 @@ def find_near(
         dy = bodies[n, k, Y] - y
         far = own_reach + other_reach
         if dx * dx + dy * dy <= far * far and k != me and other_reach > 0.0:
+            # in order of the bodies, with cells or without: the bits of a contact depend on it
+            i = min(count, SEVERAL)
+            while count < SEVERAL and i > 0 and near[m, i] > k:
+                near[m, 1 + i] = near[m, i]
+                i -= 1
             if count < SEVERAL:
-                _insert(near[m], count, k)
+                near[m, 1 + i] = k
             count += 1
     near[m, 0] = count
-    flags = BODIES if count > 0 else FREE
-    for wall in scene.walls:
-        if collision.wall_distance2(x, y, wall) <= own_reach * own_reach:
-            flags |= WALLS
+    may_touch = BODIES if count > 0 else FREE
+    for w in range(len(walls)):
+        if collision.wall_distance2(x, y, walls[w]) <= own_reach * own_reach:
+            may_touch |= WALLS
             break
     if (
         collision.map_bound(bodies[n, me], scene.grid)
         <= own_reach - bodies[n, me, RADIUS]
     ):
-        flags |= MAP  # without a map, the bound is inf
-    return flags
-
-
-@kernel(inline=True)
-def _insert(near: Integers, count: int, k: int) -> None:
-    """Insert a body into a row of `near` that lists `count` bodies.
-
-    They are in order, with cells or without: the bits of a contact depend on it.
-    """
-    i = count
-    while i > 0 and near[i] > k:
-        near[1 + i] = near[i]
-        i -= 1
-    near[1 + i] = k
+        may_touch |= MAP  # without a map, the bound is inf
+    return may_touch
 
 
 @kernel
@@ -196,14 +189,14 @@ def find_contacts(
     """
     scene = world.scene
     near = world.scratch.near
-    flags = world.scratch.may_touch[m]
+    may_touch = world.scratch.may_touch[m]
     listed = world.scratch.listed
     me = world.first + m
     body = collision.solid_of(me, world.bodies[me], scene.outlines)
     least = limit
     whom = -1
     listed.number[0] = 0
-    if flags & BODIES:
+    if may_touch & BODIES:
         is_listed = near[m, 0] <= SEVERAL
         for i in range(near[m, 0] if is_listed else len(world.bodies)):
             k = near[m, 1 + i] if is_listed else i
@@ -215,9 +208,9 @@ def find_contacts(
                 least = gap
                 whom = k
     to_bodies = least
-    if flags & WALLS:
+    if may_touch & WALLS:
         least = collision.wall_gap(body, scene.walls, least, skin, listed)
-    if flags & MAP:
+    if may_touch & MAP:
         least = collision.map_gap(body, scene.grid, least, skin, listed)
     return least, whom if least == to_bodies else -1
 

@@ -239,15 +239,41 @@ def _from_bodies(
     marks: Records,
     traffic: Traffic,
 ) -> tuple[float, float]:
-    """Return the force of all other bodies on walker k, who looks along e [m/s^2]."""
+    bodies = traffic.bodies
+    first = traffic.first
     row = traffic.plans[k]
     ax = 0.0
     ay = 0.0
-    for j in range(len(traffic.bodies)):
-        if j == k or traffic.bodies[j, RADIUS] <= 0.0:
+    for j in range(len(bodies)):
+        if j == k or bodies[j, RADIUS] <= 0.0:
             continue
-        fx, fy = _from_body(k, j, marks, traffic)
-        # Reduced by (8) outside the field of view.
+        rx = bodies[k, X] - bodies[j, X]
+        ry = bodies[k, Y] - bodies[j, Y]
+        if j < first:
+            vx = marks[j].vx
+            vy = marks[j].vy
+        else:
+            vx = traffic.speeds[j - first, 0]
+            vy = traffic.speeds[j - first, 1]
+        vx -= marks[k].vx
+        vy -= marks[k].vy
+        near = bodies[k, RADIUS] + bodies[j, RADIUS]
+        far = near + FAR * row.range + math.sqrt(vx * vx + vy * vy) * row.foresight
+        away2 = rx * rx + ry * ry
+        if away2 > far * far or away2 == 0.0:
+            continue
+        away = math.sqrt(away2)
+        share = max(away - near, NEAREST) / away
+        fx, fy = repulsion(
+            rx * share,
+            ry * share,
+            vx,
+            vy,
+            row.foresight,
+            row.repulsion,
+            row.range,
+        )
+        # Reduced by (8) outside the field of view of a walker that looks along e.
         seen = -(ex * fx + ey * fy) >= row.cos_view * math.sqrt(fx * fx + fy * fy)
         weight = 1.0 if seen else row.behind
         ax += weight * fx
@@ -255,65 +281,34 @@ def _from_bodies(
     return ax, ay
 
 
-@kernel(inline=True)
-def _from_body(k: int, j: int, marks: Records, traffic: Traffic) -> tuple[float, float]:
-    """Return the force (3, 4) of body j on walker k [m/s^2]; 0 if it is far away."""
-    bodies = traffic.bodies
-    row = traffic.plans[k]
-    rx = bodies[k, X] - bodies[j, X]
-    ry = bodies[k, Y] - bodies[j, Y]
-    if j < traffic.first:
-        vx = marks[j].vx
-        vy = marks[j].vy
-    else:
-        vx = traffic.speeds[j - traffic.first, 0]
-        vy = traffic.speeds[j - traffic.first, 1]
-    vx -= marks[k].vx
-    vy -= marks[k].vy
-    near = bodies[k, RADIUS] + bodies[j, RADIUS]
-    far = near + FAR * row.range + math.sqrt(vx * vx + vy * vy) * row.foresight
-    away2 = rx * rx + ry * ry
-    if away2 > far * far or away2 == 0.0:
-        return 0.0, 0.0
-    away = math.sqrt(away2)
-    share = max(away - near, NEAREST) / away
-    return repulsion(
-        rx * share, ry * share, vx, vy, row.foresight, row.repulsion, row.range
-    )
-
-
 @kernel
 def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
-    """Return the force (5) of walls and map on obstacle k [m/s^2]."""
     body = traffic.bodies[k]
     row = traffic.plans[k]
-    x = body[X]
-    y = body[Y]
-    far = body[RADIUS] + FAR * row.wall_range
+    walls = traffic.walls
     ax = 0.0
     ay = 0.0
-    for wall in traffic.walls:
-        ox, oy, away2 = find_wall(x, y, wall)
+    x = body[X]
+    y = body[Y]
+    radius = body[RADIUS]
+    reach = row.wall_range
+    far = radius + FAR * reach
+    for w in range(len(walls)):
+        ox, oy, away2 = find_wall(x, y, walls[w])
         if 0.0 < away2 < far * far:
             away = math.sqrt(away2)
-            size = _repel(away - body[RADIUS], row)
+            size = (
+                row.wall_repulsion / reach * math.exp(-max(away - radius, 0.0) / reach)
+            )
             ax -= size * ox / away
             ay -= size * oy / away
     away = map_distance(x, y, traffic.grid)
     if away < far:
         nx, ny = map_direction(x, y, traffic.grid)
-        size = _repel(away - body[RADIUS], row)
+        size = row.wall_repulsion / reach * math.exp(-max(away - radius, 0.0) / reach)
         ax -= size * nx
         ay -= size * ny
     return ax, ay
-
-
-@kernel
-def _repel(gap: float, row: Record) -> float:
-    """Return the size of the force (5) of a wall at a distance [m/s^2]."""
-    reach = row.wall_range
-    size: float = row.wall_repulsion / reach * math.exp(-max(gap, 0.0) / reach)
-    return size
 
 
 @kernel
@@ -465,17 +460,24 @@ def _hold_bodies(
     bend: bool,
 ) -> tuple[float, float]:
     bodies = traffic.bodies
+    first = traffic.first
+    speeds = traffic.speeds
+    period = traffic.period
+    x = bodies[k, X]
+    y = bodies[k, Y]
+    radius = bodies[k, RADIUS]
     length = math.sqrt(dx * dx + dy * dy)
     for j in range(len(bodies)):
         if j == k or bodies[j, RADIUS] <= 0.0:
             continue
-        ox = bodies[j, X] - bodies[k, X]
-        oy = bodies[j, Y] - bodies[k, Y]
-        near = bodies[k, RADIUS] + bodies[j, RADIUS]
+        ox = bodies[j, X] - x
+        oy = bodies[j, Y] - y
+        near = radius + bodies[j, RADIUS]
         step = 0.0
-        if j >= traffic.first:
-            speed = traffic.speeds[j - traffic.first]
-            step = math.sqrt(speed[0] * speed[0] + speed[1] * speed[1]) * traffic.period
+        if j >= first:
+            vx = speeds[j - first, 0]
+            vy = speeds[j - first, 1]
+            step = math.sqrt(vx * vx + vy * vy) * period
             near += ROBOT_GAP
         reach = near + 2.0 * (length + SLACK) + step
         away2 = ox * ox + oy * oy
@@ -484,21 +486,14 @@ def _hold_bodies(
         away = math.sqrt(away2)
         nx = ox / away
         ny = oy / away
-        room = _share_gap(j, away - near, nx, ny, traffic)
+        room = away - near
+        if j >= first:
+            towards = speeds[j - first, 0] * nx + speeds[j - first, 1] * ny
+            room += min(towards, 0.0) * period
+        elif traffic.plans[j].kind != STILL:
+            room *= 0.5
         dx, dy = _hold(dx, dy, nx, ny, room, bend)
     return dx, dy
-
-
-@kernel(inline=True)
-def _share_gap(j: int, gap: float, nx: float, ny: float, traffic: Traffic) -> float:
-    """Return how much of a gap to body j, in the direction n, an obstacle may use [m]."""
-    if j >= traffic.first:
-        speed = traffic.speeds[j - traffic.first]
-        towards = speed[0] * nx + speed[1] * ny
-        return gap + min(towards, 0.0) * traffic.period
-    if traffic.plans[j].kind != STILL:
-        return gap * 0.5
-    return gap
 
 
 @kernel

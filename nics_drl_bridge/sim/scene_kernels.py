@@ -403,9 +403,13 @@ def _choose_obstacles(
 @kernel
 def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> bool:
     """Place the obstacles of the scene; return True if there was space for all of them."""
+    space = plan.space
+    outlines = plan.outlines
+    gaps = scratch.gaps
+    trial = scratch.trial
     for k in range(len(bodies)):
         group = plan.groups[plan.group[k]]
-        scratch.gaps[k] = max(group.gap, MARGIN)
+        gaps[k] = max(group.gap, MARGIN)
         bodies[k, RADIUS] = 0.0
         if group.is_fixed:
             pose = plan.poses[k]
@@ -414,31 +418,23 @@ def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> b
     for k in range(len(bodies)):
         if plan.groups[plan.group[k]].is_fixed or not scratch.active[k]:
             continue
-        if not _place_obstacle(k, plan, bodies, scratch):
+        shape = int(bodies[k, SHAPE])
+        heading = 0.0
+        placed = False
+        for _ in range(TRIES):
+            x, y = _draw_point(space.for_anything, space.cells, scratch)
+            if outlines.first[shape] < outlines.first[shape + 1]:
+                heading = (2.0 * _draw(scratch) - 1.0) * math.pi
+            _put(trial, x, y, heading, shape, plan)
+            placed = _is_apart(k, plan, bodies, scratch) and _clear_of_walls(
+                trial, MARGIN, plan, scratch.listed
+            )
+            if placed:
+                _put(bodies[k], x, y, heading, shape, plan)
+                break
+        if not placed:
             return False
     return True
-
-
-@kernel(inline=True)
-def _place_obstacle(
-    k: int, plan: ScenePlan, bodies: Array, scratch: SceneScratch
-) -> bool:
-    """Place one obstacle at random; return True if there was space for it."""
-    space = plan.space
-    trial = scratch.trial
-    shape = int(bodies[k, SHAPE])
-    heading = 0.0
-    for _ in range(TRIES):
-        x, y = _draw_point(space.for_anything, space.cells, scratch)
-        if plan.outlines.first[shape] < plan.outlines.first[shape + 1]:
-            heading = (2.0 * _draw(scratch) - 1.0) * math.pi
-        _put(trial, x, y, heading, shape, plan)
-        if _is_apart(k, plan, bodies, scratch) and _clear_of_walls(
-            trial, MARGIN, plan, scratch.listed
-        ):
-            _put(bodies[k], x, y, heading, shape, plan)
-            return True
-    return False
 
 
 @kernel

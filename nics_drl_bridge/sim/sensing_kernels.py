@@ -68,26 +68,14 @@ def measure_odometry(
         data: the state, whose `past`, `odom` and `twist` are written.
         motion: length of the period.
     """
+    steps = data.steps[n]
     rows = data.past.shape[2]
-    new = data.steps[n] % rows
+    substeps = motion.substeps
+    new = steps % rows
     last = data.past[n, m, new - 1 if new > 0 else rows - 1]
-    row = data.past[n, m, new]
     noise_x = _draw_odometry_noise(n, m, 0, data)
     noise_y = _draw_odometry_noise(n, m, 1, data)
     noise_turn = _draw_odometry_noise(n, m, 2, data)
-    _add_displacement(last, start, end, row)
-    if noise_x != 0.0 or noise_y != 0.0 or noise_turn != 0.0:
-        _add_twist(row, noise_x, noise_y, noise_turn, motion)
-    row[ODOM + 2] = wrap(row[ODOM + 2])
-    row[ODOM_TWIST] = twist[0] + noise_x
-    row[ODOM_TWIST + 1] = twist[1] + noise_y
-    row[ODOM_TWIST + 2] = twist[2] + noise_turn
-    _report_odometry(n, m, row, data, motion)
-
-
-@kernel(inline=True)
-def _add_displacement(last: Array, start: Array, end: Array, row: Array) -> None:
-    """Write the odometry pose after a displacement: that from one pose (3,) to another."""
     # the displacement in the robot's frame at the start of the period
     c = math.cos(start[2])
     s = math.sin(start[2])
@@ -95,32 +83,28 @@ def _add_displacement(last: Array, start: Array, end: Array, row: Array) -> None
     dy = end[1] - start[1]
     ahead = c * dx + s * dy
     left = c * dy - s * dx
+    turn = end[2] - start[2]
     # the same displacement from the last odometry pose
     heading = last[ODOM + 2]
     c = math.cos(heading)
     s = math.sin(heading)
-    row[ODOM] = last[ODOM] + (c * ahead - s * left)
-    row[ODOM + 1] = last[ODOM + 1] + (s * ahead + c * left)
-    row[ODOM + 2] = heading + (end[2] - start[2])
-
-
-@kernel(inline=True)
-def _add_twist(row: Array, vx: float, vy: float, rate: float, motion: Dynamics) -> None:
-    """Move the odometry pose on by a twist that is held for a period."""
-    period = motion.dt * motion.substeps
-    heading = row[ODOM + 2]
-    c = math.cos(heading)
-    s = math.sin(heading)
-    turn = rate * period
-    row[ODOM], row[ODOM + 1], _, _ = move(
-        row[ODOM], row[ODOM + 1], c, s, vx, vy, turn, period, motion.series
-    )
-    row[ODOM + 2] = wrap(heading + turn)
-
-
-@kernel(inline=True)
-def _report_odometry(n: int, m: int, row: Array, data: State, motion: Dynamics) -> None:
-    """Report the newest odometry, which is in a row of `State.past`, or that of the robot's age."""
+    x = last[ODOM] + (c * ahead - s * left)
+    y = last[ODOM + 1] + (s * ahead + c * left)
+    heading += turn
+    if noise_x != 0.0 or noise_y != 0.0 or noise_turn != 0.0:
+        period = motion.dt * substeps
+        c = math.cos(heading)
+        s = math.sin(heading)
+        turn = noise_turn * period
+        x, y, _, _ = move(x, y, c, s, noise_x, noise_y, turn, period, motion.series)
+        heading = wrap(heading + turn)
+    row = data.past[n, m, new]
+    row[ODOM] = x
+    row[ODOM + 1] = y
+    row[ODOM + 2] = wrap(heading)
+    row[ODOM_TWIST] = twist[0] + noise_x
+    row[ODOM_TWIST + 1] = twist[1] + noise_y
+    row[ODOM_TWIST + 2] = twist[2] + noise_turn
     odom = data.odom[n, m]
     odom_twist = data.twist[n, m]
     # This branch avoids a division by `substeps`, which takes 1/30 of a step.
@@ -129,10 +113,8 @@ def _report_odometry(n: int, m: int, row: Array, data: State, motion: Dynamics) 
             odom[i] = row[ODOM + i]
             odom_twist[i] = row[ODOM_TWIST + i]
         return
-    steps = data.steps[n]
-    substeps = motion.substeps
     past = data.past[n, m]
-    lag = limit_lag(data.age[n, m], steps, len(past), substeps)
+    lag = limit_lag(data.age[n, m], steps, rows, substeps)
     interpolate_past(past, ODOM, lag, steps, substeps, odom)
     interpolate_past(past, ODOM_TWIST, lag, steps, substeps, odom_twist)
 
@@ -300,9 +282,16 @@ def _scan_from_past(n: int, m: int, part: Part) -> None:
 
 @kernel
 def _gather_bodies(n: int, m: int, lag: int, reach: float, part: Part) -> int:
-    """Copy the bodies around `scans.pose` of `lag` substeps ago; return their number."""
+    """Copy the bodies around `scans.pose` of `lag` substeps ago; return their number.
+
+    Robots are interpolated from their recorded past. The past of obstacles is not
+        recorded: they are moved back by their current velocity. This is exact within
+        the period, and before it for as long as the velocity was constant. The
+        extrapolation is limited to `FURTHEST_BACK`.
+    """
     data = part.data
     world_set = part.world_set
+    motion = part.motion
     scans = part.scratch.scans
     found = part.scratch.cells.found
     pose = scans.pose
@@ -313,6 +302,7 @@ def _gather_bodies(n: int, m: int, lag: int, reach: float, part: Part) -> int:
     if in_cells:
         candidates = find_around(n, pose[0], pose[1], reach, part.scratch.cells)
     count = 0
+    ago = min(lag * motion.dt, FURTHEST_BACK)
     for i in range(candidates):
         k = found[i] if in_cells else i
         radius = data.bodies[n, k, RADIUS]
@@ -321,36 +311,21 @@ def _gather_bodies(n: int, m: int, lag: int, reach: float, part: Part) -> int:
         body = scans.bodies[count]
         for j in range(BODY_COLUMNS):
             body[j] = data.bodies[n, k, j]
-        if lag > 0:
-            _move_back(body, n, k, lag, part)
+        has_turned = False
+        if lag > 0 and k >= first_robot:
+            past = data.past[n, k - first_robot]
+            interpolate_past(past, POSE, lag, data.steps[n], motion.substeps, body)
+            has_turned = True
+        elif lag > 0:
+            velocity = data.velocity[n, k]
+            for j in range(3):
+                body[j] -= velocity[j] * ago
+            has_turned = velocity[2] != 0.0
+        if has_turned:
+            body[COS] = math.cos(body[HEADING])
+            body[SIN] = math.sin(body[HEADING])
         dx = body[X] - pose[0]
         dy = body[Y] - pose[1]
         if dx * dx + dy * dy <= (reach + radius) * (reach + radius):
             count += 1
     return count
-
-
-@kernel(inline=True)
-def _move_back(body: Array, n: int, k: int, lag: int, part: Part) -> None:
-    """Move a copy of body k back to where it was `lag` substeps ago.
-
-    Robots are interpolated from their recorded past. The past of obstacles is not
-    recorded: they are moved back by their current velocity. This is exact within the
-    period, and before it for as long as the velocity was constant. The extrapolation is
-    limited to `FURTHEST_BACK`.
-    """
-    data = part.data
-    first_robot = data.velocity.shape[1]
-    has_turned = True
-    if k >= first_robot:
-        past = data.past[n, k - first_robot]
-        interpolate_past(past, POSE, lag, data.steps[n], part.motion.substeps, body)
-    else:
-        ago = min(lag * part.motion.dt, FURTHEST_BACK)
-        velocity = data.velocity[n, k]
-        for j in range(3):
-            body[j] -= velocity[j] * ago
-        has_turned = velocity[2] != 0.0
-    if has_turned:
-        body[COS] = math.cos(body[HEADING])
-        body[SIN] = math.sin(body[HEADING])

@@ -294,8 +294,9 @@ def get_surroundings(n: int, world_set: WorldSetArrays) -> Surroundings:
 def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> None:
     """Move robots and obstacles of world n, after `move_freely`; let the robots drift."""
     data = part.data
+    motion = part.motion
+    lanes = part.scratch.lanes
     start = part.scratch.contact.start
-    may_touch = part.scratch.contact.may_touch
     obstacles_move = _find_what_is_near(n, first_lane, scene, part)
     if obstacles_move:
         for k in range(len(start)):
@@ -303,36 +304,29 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
                 start[k, i] = data.bodies[n, k, i]
     any_may_touch = False
     for m in range(data.pose.shape[1]):
-        if may_touch[m] == FREE:
-            _keep_free_motion(n, m, first_lane + m, part)
-        else:
+        if part.scratch.contact.may_touch[m] != FREE:
             any_may_touch = True
+            continue
+        lane = first_lane + m
+        pose = data.pose[n, m]
+        pose[0] = lanes.pose[LANE_X, lane]
+        pose[1] = lanes.pose[LANE_Y, lane]
+        pose[2] = robot.wrap(lanes.pose[LANE_HEADING, lane])
+        for i in range(data.state.shape[2]):
+            data.state[n, m, i] = lanes.x[i, lane]
+        ahead, left, turn = draw_drift(n, m, data, motion)
+        if ahead != 0.0 or left != 0.0 or turn != 0.0:
+            c = math.cos(pose[2])
+            s = math.sin(pose[2])
+            pose[0], pose[1], _, _ = robot.move(
+                pose[0], pose[1], c, s, ahead, left, turn, 1.0, motion.series
+            )
+            pose[2] = robot.wrap(pose[2] + turn)
     if any_may_touch:
         _move_carefully(n, obstacles_move, scene, part)
     elif obstacles_move:
-        period = part.motion.dt * part.motion.substeps
+        period = motion.dt * motion.substeps
         contacts.move_obstacles(data.bodies, start, data.velocity, n, period)
-
-
-@kernel(inline=True)
-def _keep_free_motion(n: int, m: int, lane: int, part: Part) -> None:
-    """Take pose and state of a robot from its lane, and let it drift."""
-    data = part.data
-    lanes = part.scratch.lanes
-    pose = data.pose[n, m]
-    pose[0] = lanes.pose[LANE_X, lane]
-    pose[1] = lanes.pose[LANE_Y, lane]
-    pose[2] = robot.wrap(lanes.pose[LANE_HEADING, lane])
-    for i in range(data.state.shape[2]):
-        data.state[n, m, i] = lanes.x[i, lane]
-    ahead, left, turn = draw_drift(n, m, data, part.motion)
-    if ahead != 0.0 or left != 0.0 or turn != 0.0:
-        c = math.cos(pose[2])
-        s = math.sin(pose[2])
-        pose[0], pose[1], _, _ = robot.move(
-            pose[0], pose[1], c, s, ahead, left, turn, 1.0, part.motion.series
-        )
-        pose[2] = robot.wrap(pose[2] + turn)
 
 
 @kernel(inline=True)
@@ -341,35 +335,15 @@ def _find_what_is_near(
 ) -> bool:
     """Find what each robot may touch; return True if an obstacle moves."""
     data = part.data
+    lane_poses = part.scratch.lanes.pose
     contact = part.scratch.contact
+    reach = contact.reach
     cells = part.scratch.cells
     first = data.velocity.shape[1]
-    longest = -1.0  # path of any body [m]; negative as long as none moves
-    if not scene.standing:
-        longest = _bound_obstacles(n, part)
-    obstacles_move = longest >= 0.0
-    for m in range(data.pose.shape[1]):
-        path = _bound_path(n, m, first_lane + m, scene, part)
-        contact.reach[first + m] = data.bodies[n, first + m, RADIUS] + path
-        longest = max(longest, path)
-    if scene.crowded:
-        sort_into_cells(n, data.bodies[n], data.bodies.shape[1], cells)
-        cells.frame[n, MOVED] = longest
-    for m in range(data.pose.shape[1]):
-        contact.may_touch[m] = contacts.find_near(
-            n, m, data.bodies, scene, contact.near, contact.reach, cells
-        )
-    return obstacles_move
-
-
-@kernel(inline=True)
-def _bound_obstacles(n: int, part: Part) -> float:
-    """Bound the reach of the obstacles; return the longest path [m], or -1 if none moves."""
-    data = part.data
-    reach = part.scratch.contact.reach
     period = part.motion.dt * part.motion.substeps
-    longest = -1.0
-    for k in range(data.velocity.shape[1]):
+    longest = 0.0  # path of any body
+    obstacles_move = False
+    for k in range(0 if scene.standing else first):
         reach[k] = data.bodies[n, k, RADIUS]
         vx = data.velocity[n, k, 0]
         vy = data.velocity[n, k, 1]
@@ -378,25 +352,27 @@ def _bound_obstacles(n: int, part: Part) -> float:
             moved = math.sqrt(vx * vx + vy * vy) * period
             reach[k] += moved
             longest = max(longest, moved)
-    return longest
-
-
-@kernel(inline=True)
-def _bound_path(n: int, m: int, lane: int, scene: Surroundings, part: Part) -> float:
-    """Bound the path of any point of a robot in the period, drift included [m]."""
-    data = part.data
-    lane_poses = part.scratch.lanes.pose
-    period = part.motion.dt * part.motion.substeps
-    # Each component is uniform, hence at most sqrt(3) standard deviations.
-    sum_of_deviations = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
-    path: float = lane_poses[LANE_PATH, lane]
-    body = data.bodies[n, data.velocity.shape[1] + m]
-    if not is_round(body, scene.outlines):
-        # If a corner touches something, turning moves the robot away.
-        turned = lane_poses[LANE_HEADING, lane] - data.pose[n, m, 2]
-        path += abs(turned) * body[RADIUS]
-    path += math.sqrt(3.0 * period) * sum_of_deviations
-    return path
+            obstacles_move = True
+    for m in range(data.pose.shape[1]):
+        # Each component is uniform, hence at most sqrt(3) standard deviations.
+        sum_of_deviations = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
+        path = lane_poses[LANE_PATH, first_lane + m]
+        body = data.bodies[n, first + m]
+        if not is_round(body, scene.outlines):
+            # If a corner touches something, turning moves the robot away.
+            turned = lane_poses[LANE_HEADING, first_lane + m] - data.pose[n, m, 2]
+            path += abs(turned) * body[RADIUS]
+        path += math.sqrt(3.0 * period) * sum_of_deviations
+        reach[first + m] = body[RADIUS] + path
+        longest = max(longest, path)
+    if scene.crowded:
+        sort_into_cells(n, data.bodies[n], data.bodies.shape[1], cells)
+        cells.frame[n, MOVED] = longest
+    for m in range(data.pose.shape[1]):
+        contact.may_touch[m] = contacts.find_near(
+            n, m, data.bodies, scene, contact.near, reach, cells
+        )
+    return obstacles_move
 
 
 @kernel
@@ -410,7 +386,9 @@ def _move_carefully(
     """
     data = part.data
     motion = part.motion
+    single = part.scratch.single
     contact = part.scratch.contact
+    may_touch = contact.may_touch
     stops = contact.stops
     period = motion.dt * motion.substeps
     world = ContactWorld(
@@ -424,18 +402,33 @@ def _move_carefully(
         period,
     )
     stops[:] = period
-    for m in range(data.pose.shape[1]):
-        if contact.may_touch[m] != FREE:
+    for m in range(len(may_touch)):
+        if may_touch[m] != FREE:
             contacts.put_body(world.bodies[world.first + m], data.pose[n, m])
             contact.motions[m].room = 0.0
     for j in range(motion.substeps):
-        _start_substep(n, j, world, part)
+        for m in range(len(may_touch)):
+            if may_touch[m] != FREE:
+                compute_rates(n, m, j, data, motion, single)
+                dq = single.dq
+                contacts.start_motion(m, dq[0], dq[1], dq[2], world)
+                for s in range(data.state.shape[2]):
+                    now = data.state[n, m, s]
+                    bounds = robot.get_bounds(motion.terms, s)
+                    data.state[n, m, s] = robot.advance_state(
+                        now, dq[3 + s], motion.dt, bounds
+                    )
         contacts.advance(j * motion.dt, motion.dt, obstacles_move, world)
-    if _start_drift(n, world, part):
-        # A displacement is a twist over one second; the obstacles stay.
-        contacts.advance(period, 1.0, False, world)
-    for m in range(data.pose.shape[1]):
-        if contact.may_touch[m] != FREE:
+    drifts = False
+    for m in range(len(may_touch)):
+        if may_touch[m] != FREE:
+            ahead, left, turn = draw_drift(n, m, data, motion)
+            contacts.start_motion(m, ahead, left, turn, world)
+            drifts = drifts or ahead != 0.0 or left != 0.0 or turn != 0.0
+    if drifts:  # a displacement is a twist over one second; the obstacles stay
+        contacts.advance(motion.substeps * motion.dt, 1.0, False, world)
+    for m in range(len(may_touch)):
+        if may_touch[m] != FREE:
             body = world.bodies[world.first + m]
             data.pose[n, m, 0] = body[X]
             data.pose[n, m, 1] = body[Y]
@@ -444,36 +437,6 @@ def _move_carefully(
         if stops[k] < period:
             for i in range(3):
                 data.velocity[n, k, i] *= stops[k] / period
-
-
-@kernel(inline=True)
-def _start_substep(n: int, j: int, world: ContactWorld, part: Part) -> None:
-    """Start the motion of the robots that may touch something, and advance their states."""
-    data = part.data
-    motion = part.motion
-    dq = part.scratch.single.dq
-    for m in range(data.pose.shape[1]):
-        if world.scratch.may_touch[m] != FREE:
-            compute_rates(n, m, j, data, motion, part.scratch.single)
-            contacts.start_motion(m, dq[0], dq[1], dq[2], world)
-            for s in range(data.state.shape[2]):
-                now = data.state[n, m, s]
-                bounds = robot.get_bounds(motion.terms, s)
-                data.state[n, m, s] = robot.advance_state(
-                    now, dq[3 + s], motion.dt, bounds
-                )
-
-
-@kernel(inline=True)
-def _start_drift(n: int, world: ContactWorld, part: Part) -> bool:
-    """Start the drift of the robots that may touch something; return True if any drifts."""
-    drifts = False
-    for m in range(part.data.pose.shape[1]):
-        if world.scratch.may_touch[m] != FREE:
-            ahead, left, turn = draw_drift(n, m, part.data, part.motion)
-            contacts.start_motion(m, ahead, left, turn, world)
-            drifts = drifts or ahead != 0.0 or left != 0.0 or turn != 0.0
-    return drifts
 
 
 @kernel
@@ -487,10 +450,13 @@ def compute_rates(
 ) -> None:
     """Write to `single.dq` the rates of robot m in substep j, by the command then in effect."""
     size = data.state.shape[2]
+    sent = data.history.shape[2]
     for s in range(size):
         single.x[s] = data.state[n, m, s]
     for c in range(data.history.shape[3]):
-        single.x[size + c] = _find_command(n, m, c, j, data, motion)
+        delay = data.delay[n, m] + motion.terms.extra_delays[c]
+        row = robot.find_delayed_command(j, delay, motion.substeps, sent)
+        single.x[size + c] = data.history[n, m, row, c]
     robot.rates(
         single.dq,
         single.x,
@@ -554,9 +520,25 @@ def move_freely(
     robots = data.pose.shape[1]
     substeps = motion.substeps
     change = lanes.change
+    pose = lanes.pose
     for n in range(first_world, end_world):
         for m in range(robots):
-            _load_lane((n - first_world) * robots + m, n, m, data, motion, lanes)
+            lane = (n - first_world) * robots + m
+            heading = data.pose[n, m, 2]
+            pose[LANE_X, lane] = data.pose[n, m, 0]
+            pose[LANE_Y, lane] = data.pose[n, m, 1]
+            pose[LANE_COS, lane] = math.cos(heading)
+            pose[LANE_SIN, lane] = math.sin(heading)
+            pose[LANE_HEADING, lane] = heading
+            pose[LANE_PATH, lane] = 0.0
+            for s in range(data.state.shape[2]):
+                lanes.x[s, lane] = data.state[n, m, s]
+            for t in range(len(lanes.coefficient)):
+                lanes.coefficient[t, lane] = data.coefficient[n, m, t]
+            # Each command changes once in a period, at this substep.
+            for c in range(len(change)):
+                delay = data.delay[n, m] + motion.terms.extra_delays[c]
+                change[c, lane] = delay % substeps
     terms = robot.replace_coefficients(motion.terms, lanes.coefficient)
     substep = 0
     while substep < substeps:
@@ -568,10 +550,15 @@ def move_freely(
                     next_change = min(next_change, change[c, lane])
                 if change[c, lane] == substep or substep == 0:
                     n = first_world + lane // robots
-                    command = _find_command(n, lane % robots, c, substep, data, motion)
+                    m = lane % robots
+                    delay = data.delay[n, m] + motion.terms.extra_delays[c]
+                    row = robot.find_delayed_command(
+                        substep, delay, substeps, data.history.shape[2]
+                    )
+                    command = data.history[n, m, row, c]
                     lanes.x[data.state.shape[2] + c, lane] = command
         robot.run(
-            lanes.pose,
+            pose,
             lanes.x,
             lanes.dq,
             terms,
@@ -580,38 +567,3 @@ def move_freely(
             next_change - substep,
         )
         substep = next_change
-
-
-@kernel(inline=True)
-def _load_lane(
-    lane: int, n: int, m: int, data: State, motion: Dynamics, lanes: Lanes
-) -> None:
-    """Put a robot into its lane; its commands follow."""
-    pose = lanes.pose
-    heading = data.pose[n, m, 2]
-    pose[LANE_X, lane] = data.pose[n, m, 0]
-    pose[LANE_Y, lane] = data.pose[n, m, 1]
-    pose[LANE_COS, lane] = math.cos(heading)
-    pose[LANE_SIN, lane] = math.sin(heading)
-    pose[LANE_HEADING, lane] = heading
-    pose[LANE_PATH, lane] = 0.0
-    for s in range(data.state.shape[2]):
-        lanes.x[s, lane] = data.state[n, m, s]
-    for t in range(len(lanes.coefficient)):
-        lanes.coefficient[t, lane] = data.coefficient[n, m, t]
-    # Each command changes once in a period, at this substep.
-    for c in range(len(lanes.change)):
-        delay = data.delay[n, m] + motion.terms.extra_delays[c]
-        lanes.change[c, lane] = delay % motion.substeps
-
-
-@kernel(inline=True)
-def _find_command(
-    n: int, m: int, c: int, substep: int, data: State, motion: Dynamics
-) -> float:
-    """Return command c of a robot that is in effect in a substep of this period."""
-    delay = data.delay[n, m] + motion.terms.extra_delays[c]
-    row = robot.find_delayed_command(
-        substep, delay, motion.substeps, data.history.shape[2]
-    )
-    return data.history[n, m, row, c]  # type: ignore[no-any-return]

@@ -231,13 +231,6 @@ def _roll_out(
         for k in range(len(lanes.cost)):
             if lanes.ended[k] < 0:
                 _add_cost(k, t, limit, around, sampling, lanes)
-    best: int = _choose_cheapest(lanes)
-    return best
-
-
-@kernel(inline=True)
-def _choose_cheapest(lanes: RollOuts) -> int:
-    """Add the costs of the paths that are left; return the cheapest lane."""
     best = 0
     for k in range(len(lanes.cost)):
         lanes.cost[k] += (1.0 - EARLY) * lanes.way[k]
