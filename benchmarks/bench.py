@@ -274,7 +274,7 @@ def read_runs() -> dict[str, Run]:
     }
 
 
-def plan_of(folder: Path) -> dict[str, Run]:
+def make_sector_plan(folder: Path) -> dict[str, Run]:
     """Every run of the scripts in a folder, by name; a script without a row is run as it is."""
     runs = read_runs()
     known = {"bench.py", "figures.py", *(run.script for run in runs.values())}
@@ -522,7 +522,7 @@ def main() -> None:
     given = parser.parse_args()
     if given.command == "tables":
         raise SystemExit(write_tables(given.check))
-    plan = plan_of(given.scripts)
+    plan = make_sector_plan(given.scripts)
     unknown = [name for name in given.only or () if name not in plan]
     if unknown:
         parser.error(f"{unknown[0]!r} is no benchmark; there are {', '.join(plan)}.")

@@ -100,10 +100,21 @@ def pytest_report_header(config: pytest.Config) -> str:
     return f"ROS 2: {distribution}, {os.environ.get('RMW_IMPLEMENTATION', 'its usual middleware')}"
 
 
+def find_shared(name: str) -> Path:
+    """A folder of data that lies beside the repository."""
+    folder = ROOT.parent / "shared" / name
+    if not folder.is_dir():
+        pytest.skip(f"needs the {name} of others, which are not at {folder}")
+    return folder
+
+
 @pytest.fixture(scope="session")
 def shared_recordings() -> Path:
-    """The folder of real recordings that lies beside the repository."""
-    folder = ROOT.parent / "shared" / "recordings"
-    if not folder.is_dir():
-        pytest.skip(f"needs the real recordings, which are not at {folder}")
-    return folder
+    """Real recordings."""
+    return find_shared("recordings")
+
+
+@pytest.fixture(scope="session")
+def shared_barn() -> Path:
+    """Gazebo worlds and tables of the benchmark BARN, as its authors gave them."""
+    return find_shared("barn")

@@ -93,6 +93,12 @@ def direct_model(
     )
 
 
+def noisy_model(**changes) -> SimulatorModel:
+    """The same with noise of odometry and lidar; `changes` are of the lidar."""
+    sensor = lidar(noise_std=0.01, **changes)
+    return direct_model(latency=0.03, odometry=(0.05, 0.03), sensor=sensor)
+
+
 def circles(count: int, radii: tuple[float, ...] = (RADIUS,), gap: float = 0.3) -> dict:
     """A group of round obstacles."""
     shapes = [{"kind": "circle", "radius": radius} for radius in radii]

@@ -9,9 +9,9 @@ import numpy as np
 
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.arguments import check_arguments, check_options, format_value
-from nics_drl_bridge.env import guard
+from nics_drl_bridge.env import guard, reset_options
 from nics_drl_bridge.env.direct import DirectSteps, bind_steps
-from nics_drl_bridge.env.guard import give, guard_call, stop_on_error
+from nics_drl_bridge.env.guard import guard_call, stop_on_error
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.sim_backend import complete_backend, make_backend
 from nics_drl_bridge.env.snapshot import Snapshot, find_gate, find_goals
@@ -172,7 +172,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Singles, Info]:
         """Starts an episode; see Gymnasium. Raises ConfigError for a wrong seed or option."""
-        guard.check_reset(seed, options)
+        reset_options.check_reset(seed, options)
         super().reset(seed=seed)
         self._episode += 1
         if seed is not None:
@@ -189,13 +189,15 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             self.scene = sample_scene(self.world, radius, episode, self.robots)
         starts = np.array(self.scene.starts)
         if options and "start" in options:
-            give(starts[None], "start", options["start"])
-            guard.check_places("start", starts[None], [self.scene], self.world, radius)
+            reset_options.write_option(starts[None], "start", options["start"])
+            reset_options.check_places(
+                "start", starts[None], [self.scene], self.world, radius
+            )
         seeds = np.array([episode])
         episodes = Episodes(seeds, starts[None], self.scene.goals[None])
         if not self._rehearsed:
             self._try_task(episodes)
-        memory = guard.begin_task(
+        memory = reset_options.begin_task(
             self.task, episodes, options, [self.scene], self.world, "start"
         )
         self._view = self._as_batch(
@@ -278,14 +280,8 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         if before is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         self._steps += 1
-        direct = self._direct
-        if direct is not None:
-            if not direct.try_action(action):
-                direct.commands[...] = self._make_commands(action)
-            self._commands = direct.commands
-            observation, terms, ended, info = direct.advance(self.memory)
-            self.ended[0] = ended
-            return observation, terms, info
+        if self._direct is not None:
+            return self._advance_directly(self._direct, action)
         self._commands = self._make_commands(action)
         measured, facts = self._backend.step(self._commands[self._row])
         self._facts = facts
@@ -304,6 +300,16 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             row = values[self._row]
             facts[name] = row.copy() if row.ndim else row.item()
         return out.reshape(-1), terms, self._make_info(view, facts)
+
+    def _advance_directly(
+        self, direct: DirectSteps, action: AnyArray
+    ) -> tuple[Singles, dict[str, Any], Info]:
+        if not direct.try_action(action):
+            direct.commands[...] = self._make_commands(action)
+        self._commands = direct.commands
+        observation, terms, ended, info = direct.advance(self.memory)
+        self.ended[0] = ended
+        return observation, terms, info
 
     def _make_commands(self, action: AnyArray) -> Array:
         given = guard.check_action(action, self.action_space, "action")

@@ -33,8 +33,8 @@ class Guide:
         extents = np.array([member.extent for member in members])
         spans = extents[:, 2:] - extents[:, :2]
         cells = np.maximum(CELL, np.sqrt(spans.prod(axis=1) / MOST_CELLS))
-        counts = np.ceil(spans / cells[:, None])
-        sizes = np.maximum(counts[:, ::-1], 2.0).astype(np.int64)
+        counts = np.maximum(np.ceil(spans / cells[:, None]), 2.0)
+        sizes = counts[:, ::-1].astype(np.int64)
         walls = np.full((len(members), *sizes.max(axis=0)), np.inf, np.float32)
         stands = np.zeros((len(members), sampler.count), np.bool_)
         for p, scene_sampler in enumerate(sampler.samplers):
@@ -47,23 +47,16 @@ class Guide:
             stands[p, : scene_sampler.count] = [
                 motion is None for motion in scene_sampler.motions
             ]
-        frames = np.column_stack([extents[:, :2], cells])
-        inner = footprint.radius
-        if isinstance(footprint, Polygon):
-            origin = np.zeros((1, 2))
-            depths = compute_depths(origin, np.array(footprint.outline))
-            inner = abs(float(depths[0]))
         self._grid = kernels.GuideGrid(
             walls,
-            frames,
+            np.column_stack([extents[:, :2], cells]),
             sizes,
             stands,
             sampler.samplers[0].plan.outlines,
-            inner,
+            _find_inner_radius(footprint),
             footprint.radius,
         )
-        shape = (worlds, sampler.robots, *walls.shape[1:])
-        self.fields = np.zeros(shape, np.float32)
+        self.fields = np.zeros((worlds, sampler.robots, *walls.shape[1:]), np.float32)
 
     def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
         """Compute the path lengths in the scenes of episodes that begin in some worlds (n,)."""
@@ -83,3 +76,11 @@ class Guide:
             out, poses, data.member[rows], self.fields[rows], self._grid
         )
         return out
+
+
+def _find_inner_radius(footprint: Circle | Polygon) -> float:
+    """Return the radius of the circle around the origin that touches the outline [m]."""
+    if isinstance(footprint, Circle):
+        return footprint.radius
+    depths = compute_depths(np.zeros((1, 2)), np.array(footprint.outline))
+    return abs(float(depths[0]))

@@ -121,29 +121,10 @@ class BridgeParallelEnv(ParallelEnv[str, Singles, AnyArray]):
         dict[str, Info],
     ]:
         """Advances one control period; see PettingZoo. Every remaining agent needs an action."""
-        given: object = actions
-        if not isinstance(given, dict):
-            raise ConfigError(
-                f"actions of type {type(given).__name__}: must be a dict with an action per agent."
-            )
-        missing = sorted(set(self.agents) - set(actions))
-        if missing:
-            raise ConfigError(
-                f"no action for {', '.join(missing)}; each remaining agent must act."
-            )
-        space = self.env.task.action_space
-        rest: Any = np.zeros(space.shape or (), space.dtype)
-        # The env stops the robots of agents that have left, so their action does not matter.
-        joint = [actions[n] if n in self.agents else rest for n in self.possible_agents]
-        if self.env.robots == 1:
-            action = joint[0]
-        else:
-            action = np.array(joint, space.dtype).ravel()
-        observation, terms, info = self.env.advance(action)
+        observation, terms, info = self.env.advance(self._join(actions))
         if self.render_mode == "human":
             self.env.render()
         self._steps += 1
-        late = self._steps >= self._limit
         infos = {}
         rewards = {}
         ended = {}
@@ -156,9 +137,31 @@ class BridgeParallelEnv(ParallelEnv[str, Singles, AnyArray]):
             rewards[name] = sum(paid.values())
             ended[name] = bool(self.env.ended[m])
             seen[name] = observation[m]
-        truncated = dict.fromkeys(self.agents, late)
-        self.agents = [name for name in self.agents if not (late or ended[name])]
+        truncated = dict.fromkeys(self.agents, self._steps >= self._limit)
+        self.agents = [
+            name for name in self.agents if not (ended[name] or truncated[name])
+        ]
         return seen, rewards, ended, truncated, infos
+
+    def _join(self, actions: object) -> Any:
+        """Returns the team's action. Raises ConfigError if a remaining agent has none."""
+        if not isinstance(actions, dict):
+            raise ConfigError(
+                f"actions of type {type(actions).__name__}: must be a dict with an action per "
+                "agent."
+            )
+        missing = sorted(set(self.agents) - set(actions))
+        if missing:
+            raise ConfigError(
+                f"no action for {', '.join(missing)}; each remaining agent must act."
+            )
+        space = self.env.task.action_space
+        rest: Any = np.zeros(space.shape or (), space.dtype)
+        # The env stops the robots of agents that have left, so their action does not matter.
+        joint = [actions[n] if n in self.agents else rest for n in self.possible_agents]
+        if self.env.robots == 1:
+            return joint[0]
+        return np.array(joint, space.dtype).ravel()
 
     def halt(self) -> None:
         """Stops every robot until the next reset; any exception does so too."""

@@ -18,6 +18,7 @@ from nics_drl_bridge.env.snapshot import Snapshot, locate_hits
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.style import DARK, EDGE, GOAL, OTHER, SERIES, VERMILION
 
@@ -106,22 +107,8 @@ def draw_world(
 ) -> None:
     """Draws map, walls and obstacles (K, 7), see `sim.scenes.Scene`; x and y in `map` [m]."""
     place = world.members[member]
-    grid = place.grid
-    if grid is not None:
-        rows, columns = grid.cells.shape
-        corners = np.indices((rows + 1, columns + 1)) - 0.5
-        places = grid.cell_to_world(np.moveaxis(corners, 0, -1))
-        shade = np.where(grid.blocked, 0.2, 0.8)
-        shade[grid.free] = 1.0
-        axes.pcolormesh(
-            places[..., 0],
-            places[..., 1],
-            shade,
-            cmap="gray",
-            vmin=0.0,
-            vmax=1.0,
-            rasterized=True,
-        )
+    if place.grid is not None:
+        _draw_map(axes, place.grid)
     if place.bounds is not None:
         low, high = np.array(place.bounds).reshape(2, 2)
         axes.add_patch(
@@ -132,6 +119,17 @@ def draw_world(
     for body in bodies:
         if body[RADIUS] > 0.0:
             axes.add_patch(_make_patch(world, body))
+
+
+def _draw_map(axes: Axes, grid: GridMap) -> None:
+    rows, columns = grid.cells.shape
+    corners = np.indices((rows + 1, columns + 1)) - 0.5
+    places = grid.cell_to_world(np.moveaxis(corners, 0, -1))
+    shade = np.where(grid.blocked, 0.2, 0.8)
+    shade[grid.free] = 1.0
+    x = places[..., 0]
+    y = places[..., 1]
+    axes.pcolormesh(x, y, shade, cmap="gray", vmin=0.0, vmax=1.0, rasterized=True)
 
 
 def _make_patch(world: AnyWorld, body: NDArray[np.float64]) -> Patch:

@@ -131,16 +131,15 @@ class SimBackend:
     def _measure(self) -> RobotView:
         data = self.simulator.data
         now = self.now_ns
-        row = self._row
-        odom = data.odom[row].copy()
-        twist = data.twist[row].copy()
-        ranges = data.ranges[row].copy()
         if not self._middlewares:
+            row = self._row
             sensed = {
                 name: readings[row].copy()
                 for name, readings in self.simulator.readings.items()
             }
-            return RobotView(odom, twist, ranges, now * 1e-9, 0.0, 0.0, sensed)
+            scan = data.ranges[row].copy()
+            motion = data.odom[row].copy(), data.twist[row].copy()
+            return RobotView(*motion, scan, now * 1e-9, 0.0, 0.0, sensed)
         views = []
         for m, middleware in enumerate(self._middlewares):
             pose = _decode_pose(data.odom[0, m])

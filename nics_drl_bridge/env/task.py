@@ -17,7 +17,7 @@ from nics_drl_bridge.interface import Array, RobotView
 from nics_drl_bridge.kernels import Packed, pack
 from nics_drl_bridge.lidar.arrays import AnyArray, Integers, Singles
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
-from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, plan_of
+from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, make_sector_plan
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.kinds import find_command, has_textbook, reach
@@ -259,27 +259,7 @@ class Task(ABC):
         """Computes the parts of a step one by one; a class may override it with a single pass."""
         kept = dict(memory)
         self.update(before, after, memory)
-        if memory.keys() != kept.keys():
-            raise self._make_error(
-                f"memory {sorted(memory)}", f"must keep {sorted(kept)} from `reset`"
-            )
-        # Copy replaced arrays into the env's rows. Read all of them first: they may
-        # alias.
-        rebound = {
-            name: np.array(memory[name])
-            for name, rows in kept.items()
-            if memory[name] is not rows
-        }
-        for name, new in rebound.items():
-            rows = memory[name] = kept[name]
-            if new.shape != rows.shape or not np.can_cast(
-                new.dtype, rows.dtype, "same_kind"
-            ):
-                like = f"must stay {rows.dtype} of shape {rows.shape} in `update`"
-                raise self._make_error(
-                    f"memory {name!r}", f"{like}, not {new.dtype} of shape {new.shape}"
-                )
-            rows[...] = new
+        self._keep_rows(kept, memory)
         out[...] = self.check_result(
             "observation", self.observation(after, memory), out.shape
         )
@@ -300,6 +280,29 @@ class Task(ABC):
                 "end", f"must be True or False for each robot, not {kind}"
             )
         return Outcome(terms, ended, info)
+
+    def _keep_rows(self, kept: Memory, memory: Memory) -> None:
+        """Copies arrays that `update` replaced into the env's own rows, which were `kept`."""
+        if memory.keys() != kept.keys():
+            raise self._make_error(
+                f"memory {sorted(memory)}", f"must keep {sorted(kept)} from `reset`"
+            )
+        # Read all of them first: they may alias.
+        replaced = {
+            name: np.array(memory[name])
+            for name, rows in kept.items()
+            if memory[name] is not rows
+        }
+        for name, new in replaced.items():
+            rows = memory[name] = kept[name]
+            if new.shape != rows.shape or not np.can_cast(
+                new.dtype, rows.dtype, "same_kind"
+            ):
+                like = f"must stay {rows.dtype} of shape {rows.shape} in `update`"
+                raise self._make_error(
+                    f"memory {name!r}", f"{like}, not {new.dtype} of shape {new.shape}"
+                )
+            rows[...] = new
 
     def bind(self, before: Array, view: RobotView) -> BoundStep | None:
         """Binds steps of one robot to its view (1, 1) and last pose (1, 1, 3), updated in place.
@@ -432,7 +435,7 @@ class Task(ABC):
     @cached_property
     def plan(self) -> SectorPlan:
         """Mapping of the lidar's beams to the sectors of `scan`; empty without `scan`."""
-        return NO_PLAN if self.scan is None else plan_of(self.lidar, self.scan)
+        return NO_PLAN if self.scan is None else make_sector_plan(self.lidar, self.scan)
 
     @cached_property
     def scale(self) -> Any:

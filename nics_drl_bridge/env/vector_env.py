@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import defaults
 from nics_drl_bridge.arguments import check_arguments, check_count, format_value
-from nics_drl_bridge.env import guard
+from nics_drl_bridge.env import guard, reset_options
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.kernels import compute_episode_seeds
 from nics_drl_bridge.env.registry import make_task
@@ -187,7 +187,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, Info]:
         """Starts an episode in every world; world i takes its seeds from `seed + i`."""
-        guard.check_reset(seed, options, self.num_envs)
+        reset_options.check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
         count = self.num_envs
         chosen = np.ones(count, np.bool_)
@@ -249,12 +249,12 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         starts = None
         if options and "start" in options:
             starts = np.empty((len(worlds), self.robots, 3))
-            guard.give(starts, "start", options["start"])
+            reset_options.write_option(starts, "start", options["start"])
 
         def places(scenes: Scenes) -> Array | None:
             if starts is not None:
                 radius = self.model.robot.footprint_radius
-                guard.check_places("start", starts, scenes, self.world, radius)
+                reset_options.check_places("start", starts, scenes, self.world, radius)
             return starts
 
         scenes = self.simulator.reset(seeds, worlds, places)
@@ -264,7 +264,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         self._starts[worlds] = self.simulator.data.pose[worlds]
         goals = self.simulator.goals[worlds]
         episodes = Episodes(seeds, self._starts[worlds], goals)
-        fresh = guard.begin_task(
+        fresh = reset_options.begin_task(
             self.task, episodes, options, scenes, self.world, "start", "reset_mask"
         )
         for name, rows in fresh.items():
@@ -312,25 +312,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         )
         terminated = self.ended.all(axis=1) & ~resetting
         truncated = (self.simulator.data.steps >= self._limit) & ~resetting
-        rewards = total(self._reward)
-        reward = np.where(resetting, 0.0, rewards)
+        reward = np.where(resetting, 0.0, total(self._reward))
         done = terminated | truncated
         infos: Info = {}
-        facts = {
-            "stamp_ns": self.simulator.data.steps * self._period_ns,
-            "true_pose": self._drop_robot_axis(self.simulator.data.pose).copy(),
-            "true_collision": self._drop_robot_axis(
-                self.simulator.data.collided
-            ).astype(np.bool_),
-            **{
-                name: self._drop_robot_axis(values).copy()
-                for name, values in outcome.info.items()
-            },
-            "reward_terms": {
-                name: self._drop_robot_axis(t).copy()
-                for name, t in outcome.terms.items()
-            },
-        }
+        facts = self._describe(outcome)
         if self._mode is AutoresetMode.NEXT_STEP:
             self._awaits_reset = done
             self._add_infos(infos, facts, resetting)
@@ -342,6 +327,24 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
             self._add_infos(infos, facts, done)
         self.ready = True
         return flatten(out), reward, terminated, truncated, infos
+
+    def _describe(self, outcome: Outcome) -> Info:
+        """Returns the facts of a step, in arrays of the caller's own."""
+        data = self.simulator.data
+
+        def copy_all(values: Facts) -> Facts:
+            return {
+                name: self._drop_robot_axis(rows).copy()
+                for name, rows in values.items()
+            }
+
+        return {
+            "stamp_ns": data.steps * self._period_ns,
+            "true_pose": self._drop_robot_axis(data.pose).copy(),
+            "true_collision": self._drop_robot_axis(data.collided).astype(np.bool_),
+            **copy_all(outcome.info),
+            "reward_terms": copy_all(outcome.terms),
+        }
 
     def _advance(
         self, part: slice, actions: AnyArray, out: Observation, resetting: Flags

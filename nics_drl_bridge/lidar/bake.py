@@ -113,19 +113,16 @@ def make_grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> 
     high = _reach_of(edges[..., 1], parts, np.maximum) / spec.angle_increment
     cell[..., 0] = np.floor(low - 0.5)
     cell[..., 1] = np.ceil(high + 0.5) - cell[..., 0] + 1
-    if not is_round:
-        for side in (0, 1):
-            wound = _wound(
-                hull, hints[..., side], edges[..., side] - turns[:, None] + side * np.pi
-            )
-            two, climb = _choose_corners(wound, parts, len(hull))
-            miss = _miss(hull, two, edges[..., side], turns, distances, parts)
-            far_off = miss > MISS * spec.angle_increment
-            # close to contact, the border of a cell does not bound its interior
-            far_off[:, 0] = True
-            cell[..., 2 + 2 * side : 4 + 2 * side] = np.where(
-                far_off[..., None], climb, two
-            )
+    for side in () if is_round else (0, 1):
+        edge = edges[..., side]
+        wound = _wound(hull, hints[..., side], edge - turns[:, None] + side * np.pi)
+        two, climb = _choose_corners(wound, parts, len(hull))
+        miss = _miss(hull, two, edge, turns, distances, parts)
+        far_off = miss > MISS * spec.angle_increment
+        # close to contact, the border of a cell does not bound its interior
+        far_off[:, 0] = True
+        corners = np.where(far_off[..., None], climb, two)
+        cell[..., 2 + 2 * side : 4 + 2 * side] = corners
     if cell[..., 1].max() > MOST_WIDE or cell[..., 0].min() < FIRST_BEAM:
         raise ConfigError(
             f"{describe(shape)} covers too many beams to be baked: they are "

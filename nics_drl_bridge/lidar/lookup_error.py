@@ -23,13 +23,14 @@ The errors of the beams of one placement are correlated, so placements are the
 independent samples, not beams.
 """
 
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar import scan_kernels
-from nics_drl_bridge.lidar.arrays import Array
+from nics_drl_bridge.lidar.arrays import AnyArray, Array
 from nics_drl_bridge.lidar.maps import stack_fixtures
 from nics_drl_bridge.lidar.scan_kernels import LidarArrays
 from nics_drl_bridge.lidar.shapes import place
@@ -65,23 +66,18 @@ def find_lookup_distances(
     """
     corners, first = exact.outlines
     outline = corners[first[shape] : first[shape + 1]]
-    high = exact.range_max
-    nearest = TOUCHING * high
-    edges = np.geomspace(nearest, high, RINGS)
+    nearest = TOUCHING * exact.range_max
+    edges = np.geomspace(nearest, exact.range_max, RINGS)
     rings = np.concatenate([[0.0], edges]) + radius
-    limits = np.geomspace(max(exact.range_min, nearest), high, BANDS + 1)
-    bands = limits[1:-1]
+    lowest = max(exact.range_min, nearest)
+    limits = np.geomspace(lowest, exact.range_max, BANDS + 1)
     squares = np.zeros((RINGS, PLACES, BANDS))
     counts = np.zeros((RINGS, PLACES, BANDS))
     worst = np.zeros(RINGS)
     for i in range(RINGS):
         poses = _place_around(exact, rings[i : i + 2], SEED + i)
         errors = _compare(place(poses[:, None], radius, shape), exact, baked)
-        cell = errors.placement * BANDS + np.searchsorted(bands, errors.truth)
-        sums = np.bincount(cell, np.square(errors.error), PLACES * BANDS)
-        squares[i] = sums.reshape(PLACES, BANDS)
-        beams = np.bincount(cell, minlength=PLACES * BANDS)
-        counts[i] = beams.reshape(PLACES, BANDS)
+        squares[i], counts[i] = _sum_by_band(errors, limits[1:-1])
         worst[i] = np.abs(errors.error).max(initial=0.0)
         if len(outline) > 0:
             poses = _turn_edge_on(poses, outline, SEED + i)
@@ -90,13 +86,12 @@ def find_lookup_distances(
     # The widest interval of rings with small errors, if one is wide enough.
     best = (np.inf, np.inf)
     width = NARROWEST * (rings[-1] - rings[0])
-    for i in range(RINGS):
-        for j in range(i + 1, RINGS + 1):
-            if rings[j] - rings[i] <= width or worst[i:j].max() > OUTLIER:
-                continue
-            if _is_small(squares[i:j], counts[i:j], greatest):
-                best = (float(rings[i]), float(rings[j]))
-                width = rings[j] - rings[i]
+    for i, j in combinations(range(RINGS + 1), 2):
+        if rings[j] - rings[i] <= width or worst[i:j].max() > OUTLIER:
+            continue
+        if _is_small(squares[i:j], counts[i:j], greatest):
+            best = (float(rings[i]), float(rings[j]))
+            width = rings[j] - rings[i]
     return best
 
 
@@ -106,6 +101,14 @@ class _Errors(NamedTuple):
     placement: NDArray[np.int_]  # index of the placement
     truth: Array  # exact range [m]
     error: Array  # looked-up range minus exact range [m]
+
+
+def _sum_by_band(errors: _Errors, limits: Array) -> tuple[AnyArray, AnyArray]:
+    """Return squared errors and numbers of beams (P, B) of each placement, by band of range."""
+    cell = errors.placement * BANDS + np.searchsorted(limits, errors.truth)
+    squares = np.bincount(cell, np.square(errors.error), PLACES * BANDS)
+    counts = np.bincount(cell, minlength=PLACES * BANDS)
+    return squares.reshape(PLACES, BANDS), counts.reshape(PLACES, BANDS)
 
 
 def _is_small(squares: Array, counts: Array, greatest: float) -> bool:
@@ -124,18 +127,24 @@ def _is_small(squares: Array, counts: Array, greatest: float) -> bool:
 
 def _compare(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> _Errors:
     """Scan bodies (P, 1, 7) of P placements by both renderers."""
-    mount = exact.mount
-    directions = exact.beams.directions
+    count = exact.beams.directions.shape[1]
     # the lidar is at the origin
-    robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))
-    scans = np.empty((2, PLACES, 1, directions.shape[1]), np.float32)
-    worlds = np.arange(PLACES)
-    scratch = scan_kernels.scan_scratch(directions.shape[1])
+    robots = np.tile([-exact.mount[0], -exact.mount[1], 0.0], (PLACES, 1, 1))
+    scans = np.empty((2, PLACES, 1, count), np.float32)
+    scratch = scan_kernels.scan_scratch(count)
     nearby = np.arange(bodies.shape[1], dtype=np.int32)
     empty = stack_fixtures([np.zeros((0, 4))], [None], np.zeros(PLACES, np.int64))
     for ranges, sensor in zip(scans, (exact, baked), strict=True):
         scan_kernels.scan_worlds(
-            ranges, robots, worlds, bodies, nearby, -1, empty, sensor, scratch
+            ranges,
+            robots,
+            np.arange(PLACES),
+            bodies,
+            nearby,
+            -1,
+            empty,
+            sensor,
+            scratch,
         )
     exact_ranges, baked_ranges = scans[:, :, 0].astype(np.float64)
     both = np.isfinite(exact_ranges) & np.isfinite(baked_ranges)
@@ -174,6 +183,5 @@ def _turn_edge_on(poses: Array, outline: Array, seed: int) -> Array:
     bearing = np.arctan2(poses[:, 1], poses[:, 0])
     direction = np.arctan2(along[chosen, 1], along[chosen, 0])
     onto = np.arcsin(np.clip(aside[chosen] / distance, -1.0, 1.0))
-    slant = rng.uniform(-SLANT, SLANT, len(poses))
-    heading = bearing - direction + onto + slant
+    heading = bearing - direction + onto + rng.uniform(-SLANT, SLANT, len(poses))
     return np.column_stack([poses[:, :2], heading])

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -95,25 +96,30 @@ class GridMap:
         if not self.blocked.any():
             return np.full(self.cells.shape, np.inf, np.float32)
         rows, columns = self.cells.shape
-        # At half the cell size, centres and corners are points of one lattice, and the point of a
-        # square nearest to a lattice point is one too.
-        clear = np.ones((2 * rows + 1, 2 * columns + 1), bool)
-        at, to = np.nonzero(self.blocked)
-        for down in range(3):
-            for right in range(3):
-                clear[2 * at + down, 2 * to + right] = False
         # The nearest lattice points take far less memory than distances at every lattice point.
         nearest = scipy.ndimage.distance_transform_edt(
-            clear, return_distances=False, return_indices=True
+            self._find_clear_points(), return_distances=False, return_indices=True
         )
         distances = np.empty((rows, columns), np.float32)
-        own_columns = 2 * np.arange(columns) + 1
+        own_columns = 2.0 * np.arange(columns) + 1.0
         for row in range(rows):
-            up = nearest[0, 2 * row + 1, 1::2] - (2.0 * row + 1.0)
-            right = nearest[1, 2 * row + 1, 1::2] - own_columns.astype(np.float64)
-            steps = np.sqrt(up * up + right * right)
-            distances[row] = steps * (self.resolution / 2.0)
+            dy = nearest[0, 2 * row + 1, 1::2] - (2.0 * row + 1.0)
+            dx = nearest[1, 2 * row + 1, 1::2] - own_columns
+            distances[row] = np.sqrt(dy * dy + dx * dx) * (self.resolution / 2.0)
         return distances
+
+    def _find_clear_points(self) -> Mask:
+        """(2 rows + 1, 2 columns + 1) points of a lattice that are in no blocked square.
+
+        At half the cell size, centres and corners are points of one lattice, and the point of a
+        square nearest to a lattice point is one too.
+        """
+        rows, columns = self.cells.shape
+        clear = np.ones((2 * rows + 1, 2 * columns + 1), np.bool_)
+        at, to = np.nonzero(self.blocked)
+        for down, right in product(range(3), repeat=2):
+            clear[2 * at + down, 2 * to + right] = False
+        return clear
 
 
 MAX_CELLS = 64_000_000

@@ -108,7 +108,7 @@ def count_sectors(lidar: LidarSpec) -> int:
 def covers(lidar: LidarSpec, layout: str) -> bool:
     """True if a lidar can fill a layout of `LAYOUTS`."""
     try:
-        plan_of(lidar, LAYOUTS[layout])
+        make_sector_plan(lidar, LAYOUTS[layout])
     except ConfigError:
         return False
     return True
@@ -127,7 +127,7 @@ NO_PLAN = SectorPlan(  # for policies that observe the beams themselves
 )
 
 
-def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
+def make_sector_plan(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
     """Return the plan for a lidar and a layout; ConfigError if the lidar can't fill it."""
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
@@ -135,17 +135,7 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
     first, count = np.zeros((2, layout.sectors), np.int32)
     for s, middle in enumerate(layout.angles):
         away = wrap_angle(angles - middle)
-        inside = np.abs(away) <= 0.5 * layout.width + BORDER_RAD
-        begins = np.flatnonzero(inside & ~np.roll(inside, 1))
-        if inside.any():
-            first[s] = begins[0] if len(begins) > 0 else 0
-            count[s] = inside.sum()
-        else:  # the adjacent beams
-            below = int(np.argmax(np.where(away < 0.0, away, -np.inf)))
-            above = int(np.argmin(np.where(away >= 0.0, away, np.inf)))
-            beside = [b for b in (below, above) if abs(away[b]) <= COARSEST_RAD]
-            first[s] = beside[0]
-            count[s] = len(beside)
+        first[s], count[s] = _find_beams(away, 0.5 * layout.width)
     left_open = 2.0 * np.pi - (lidar.angles[-1] - lidar.angles[0])
     closed = left_open <= max(COARSEST_RAD, lidar.angle_increment)
     return SectorPlan(
@@ -161,10 +151,23 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
     )
 
 
+def _find_beams(away: Array, half_width: float) -> tuple[int, int]:
+    """Return the first beam and the number of beams in a sector.
+
+    `away` (B,) are their angles from its middle [rad]. If no beam is in it, those beside it count.
+    """
+    inside = np.abs(away) <= half_width + BORDER_RAD
+    if inside.any():
+        begins = np.flatnonzero(inside & ~np.roll(inside, 1))
+        return int(begins[0]) if len(begins) > 0 else 0, int(inside.sum())
+    below = int(np.argmax(np.where(away < 0.0, away, -np.inf)))
+    above = int(np.argmin(np.where(away >= 0.0, away, np.inf)))
+    beside = [b for b in (below, above) if abs(away[b]) <= COARSEST_RAD]
+    return beside[0], len(beside)
+
+
 def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
-    apart = np.inf
-    if lidar.beams > 1:
-        apart = lidar.angle_increment
+    apart = lidar.angle_increment if lidar.beams > 1 else np.inf
     if apart > COARSEST_RAD:
         step, most = np.degrees([apart, COARSEST_RAD])
         seen = f"the beams of the lidar {lidar.name!r} are {step:.3g} deg apart"
@@ -174,23 +177,26 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
         seen = f"range_max of the lidar {lidar.name!r} is {lidar.range_max:g} m"
         reason = f"{seen}, the scan layout needs {layout.range_max:g} m"
         raise ConfigError(f"{reason}; {_narrower(lidar, layout)}.", reason=reason)
-    steps = max(
-        layout.sectors, int(np.ceil((layout.angle_max - layout.angle_min) / apart))
-    )
-    wanted = np.linspace(layout.angle_min, layout.angle_max, steps + 1)
-    ordered = np.sort(np.mod(angles, 2.0 * np.pi))
-    ordered = np.concatenate(
-        [ordered[-1:] - 2.0 * np.pi, ordered, ordered[:1] + 2.0 * np.pi]
-    )
-    place = np.mod(wanted, 2.0 * np.pi)
-    after = np.searchsorted(ordered, place).clip(1, len(ordered) - 1)
-    gap = np.minimum(place - ordered[after - 1], ordered[after] - place)
-    if (gap > apart + BORDER_RAD).any():
+    if _find_widest_gap(angles, layout, apart) > apart + BORDER_RAD:
         limits = np.degrees([angles[0], angles[-1], layout.angle_min, layout.angle_max])
         a, b, c, d = (f"{limit:.4g}" for limit in limits)
         seen = f"the lidar {lidar.name!r} looks from {a} to {b} deg in base_link"
         reason = f"{seen}, the scan layout needs {c} to {d}"
         raise ConfigError(f"{reason}; {_narrower(lidar, layout)}.", reason=reason)
+
+
+def _find_widest_gap(angles: Array, layout: ScanLayout, apart: float) -> float:
+    """Return how far the nearest beam is away from any direction in a layout [rad]."""
+    steps = int(np.ceil((layout.angle_max - layout.angle_min) / apart))
+    count = max(layout.sectors, steps) + 1
+    wanted = np.linspace(layout.angle_min, layout.angle_max, count) % (2.0 * np.pi)
+    ordered = np.sort(angles % (2.0 * np.pi))
+    ordered = np.concatenate(
+        [ordered[-1:] - 2.0 * np.pi, ordered, ordered[:1] + 2.0 * np.pi]
+    )
+    after = np.searchsorted(ordered, wanted).clip(1, len(ordered) - 1)
+    gaps = np.minimum(wanted - ordered[after - 1], ordered[after] - wanted)
+    return float(gaps.max())
 
 
 def _narrower(lidar: LidarSpec, layout: ScanLayout) -> str:

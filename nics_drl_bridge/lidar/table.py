@@ -130,7 +130,6 @@ class LidarTable:
         """The table for the kernels."""
         outlines = self.outlines
         distances = self.density.distances
-        orders = outlines.orders
         rotations = self.grid[:, 1]
         corners = np.diff(outlines.hull) // 2
         circles = np.array([isinstance(shape, Circle) for shape in self.shapes], bool)
@@ -138,25 +137,30 @@ class LidarTable:
         shapes["distances_per_metre"] = (distances - 1) / (
             self.grid[:, 0] - outlines.radii
         )
-        shapes["rotations"] = np.where(circles, 0.0, rotations * orders)
+        shapes["rotations"] = np.where(circles, 0.0, rotations * outlines.orders)
         shapes["periods_per_grid_rotation"] = 1.0 / rotations
         shapes["first_cell"] = self.grid[:, 2]
         shapes["cells_per_period"] = rotations * distances
         shapes["second_hull"] = outlines.hull[:-1] + corners
-        shapes["corners_per_period"] = corners // orders
+        shapes["corners_per_period"] = corners // outlines.orders
         shapes["corners"] = corners
         shapes["round_radius"] = np.where(circles, outlines.radii, 0.0)
-        shift = self.density.phases.bit_length() - 1
         cell = self.cell.astype(np.int32)
         # Extent of the row, corners on the right and on the left: see `TableArrays.cells`.
         pairs = (cell[:, [0, 3, 5]] << 16) | (cell[:, [1, 2, 4]] & MOST_WIDE)
         cells = np.column_stack([self.start, pairs])
-        missing = max(LEAST_FUSED - count_padding(self.beam_angle), 0)
-        if missing:
-            rows = np.append(self.rows, np.zeros(missing, np.float32))
-        else:
-            rows = self.rows
-        return TableArrays(shapes, distances, cells, rows, shift, outlines.hulls)
+        rows = self.rows
+        missing = LEAST_FUSED - count_padding(self.beam_angle)
+        if missing > 0:
+            rows = np.append(rows, np.zeros(missing, np.float32))
+        return TableArrays(
+            shapes,
+            distances,
+            cells,
+            rows,
+            self.density.phases.bit_length() - 1,
+            outlines.hulls,
+        )
 
     @property
     def memory(self) -> int:

@@ -254,7 +254,9 @@ class Estimator:
             needed_ns = self.time_ns
         self._twist = None
         # Individual delays of commands come on top of the common latency.
-        needed_ns -= int(self._motion.terms.late.max(initial=0)) * self._motion.step_ns
+        needed_ns -= (
+            int(self._motion.terms.extra_delays.max(initial=0)) * self._motion.step_ns
+        )
         effective, commands = kernels.insert_command(
             self._log,
             self.compute_effect_time(stamp_ns),

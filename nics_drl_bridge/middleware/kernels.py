@@ -198,7 +198,7 @@ def read_commands(
     """Writes the commands (C,) in effect just before a time; returns when they change next [ns]."""
     following = np.iinfo(np.int64).max
     for c in range(command.shape[0]):
-        delay = motion.terms.late[c] * motion.step_ns
+        delay = motion.terms.extra_delays[c] * motion.step_ns
         k = find_command(log, time - delay)
         command[c] = log.commands[k, c]
         if k + 1 < log.effective.shape[0]:

@@ -652,9 +652,9 @@ def make_fast_simulator(
 ) -> FastSimulator:
     """Make the fast simulator with the lidar renderer that the parameter `renderer` names."""
     renderer = declare_renderer(node, defaults.RENDERER)
-    tell = node.get_logger().warning
+    warn = node.get_logger().warning
     drawn = device_parameters.get_randomisation(node)
-    options: Any = {"renderer": renderer, "randomisation": drawn, "tell": tell}
+    options: Any = {"renderer": renderer, "randomisation": drawn, "warn": warn}
     return FastSimulator(model, world, robots=robots, **options)
 
 

@@ -125,11 +125,11 @@ def drive(
     """Runs one episode to its end; halts the robot if the policy or a callback raises."""
     try:
         steps = _drive_steps(env, policy, seed, options, on_start)
-        _, _, info = next(steps)
-        goal = info.get("goal")
-        bodies = info["bodies"]
+        _, _, info_at_start = next(steps)
+        goal = info_at_start.get("goal")
         if goal is None:  # a user's task may not expose its goal
             goal = env.get_wrapper_attr("scene").goals[0]
+        info = info_at_start
         paths = [info["start"]]
         estimates = [info["pose"]]
         total = 0.0
@@ -143,30 +143,47 @@ def drive(
             total += float(reward)
         collided = "collision" if np.any(info.get("collision", False)) else "time-out"
         believed = "success" if np.all(info.get("is_success", False)) else collided
-        driven = np.array(paths), np.array(estimates), goal, bodies, total
+        driven = (
+            np.array(paths),
+            np.array(estimates),
+            goal,
+            info_at_start["bodies"],
+            total,
+        )
+        if "true_pose" in info:
+            task = getattr(env.unwrapped, "task", None)
+            result = _judge(believed, info, task, goal, touched)
+            return Episode(seed, result, *driven, believed)
         uncertain = None
         if covariances:
             uncertain = compute_uncertainty_gain(covariances[0], covariances[-1])
-        if "true_pose" not in info:
-            return Episode(seed, believed, *driven, uncertain=uncertain)
-        collisions = info.get("true_collision")
-        # Without ground truth, use `touched` if given, otherwise the robot's own
-        # judgement.
-        if collisions is None:
-            collisions = believed == "collision" if touched is None else touched()
-        hit = bool(np.any(collisions))
-        near_goal = is_truly_near(
-            getattr(env.unwrapped, "task", None), info["true_pose"], goal
-        ).all()
-        wrong = (believed == "success" and not near_goal) or believed == "collision"
-        true = ELSEWHERE if wrong else believed
-        return Episode(seed, "collision" if hit else true, *driven, believed)
+        return Episode(seed, believed, *driven, uncertain=uncertain)
     except BaseException:
         # The env does not see errors raised by the policy.
         if isinstance(env.unwrapped, BridgeEnv):
             with delay_interrupts():
                 env.unwrapped.halt()
         raise
+
+
+def _judge(
+    believed: str,
+    info: dict[str, Any],
+    task: Any,
+    goal: Array,
+    touched: Callable[[], bool] | None,
+) -> str:
+    """Returns the true result of an episode, from the `info` of its last step."""
+    collisions = info.get("true_collision")
+    # Without ground truth, use `touched` if given, otherwise the robot's own judgement.
+    if collisions is None:
+        collisions = believed == "collision" if touched is None else touched()
+    if np.any(collisions):
+        return "collision"
+    is_near = is_truly_near(task, info["true_pose"], goal).all()
+    if (believed == "success" and not is_near) or believed == "collision":
+        return ELSEWHERE
+    return believed
 
 
 def is_truly_near(task: Any, poses: Array, goals: Array) -> Mask:
@@ -259,19 +276,25 @@ def _drive_once(env: BridgeVectorEnv, act: Act, seeds: Integers) -> tuple[Any, .
         reward += np.where(running, gain, 0.0)
         steps += running
         ended = running & over
-        seen = _get_flags(info, "collision").any(axis=1)
-        hit = _get_flags(
-            info, "true_collision" if "true_collision" in info else "collision"
-        )
-        collision |= ended & hit.any(axis=1)
-        arrived = ended & ~seen & _get_flags(info, "is_success").all(axis=1)
-        believed |= arrived
-        if arrived.any() and "goal" in info:
-            near = is_truly_near(env.task, info["true_pose"], info["goal"])
-            arrived = arrived & near.reshape(count, -1).all(axis=1)
-        success |= arrived & ~hit.any(axis=1)
+        arrived, truly_arrived, hit = _judge_worlds(env.task, info)
+        believed |= ended & arrived
+        success |= ended & truly_arrived & ~hit
+        collision |= ended & hit
         running &= ~ended
     return success, collision, steps, length, reward, believed
+
+
+def _judge_worlds(task: Any, info: dict[str, Any]) -> tuple[Mask, Mask, Mask]:
+    """Returns flags (N,): believed to have arrived, truly there, and truly touched something."""
+    seen = np.asarray(_get_flags(info, "collision").any(axis=1))
+    arrived = np.asarray(_get_flags(info, "is_success").all(axis=1)) & ~seen
+    is_there = arrived
+    if arrived.any() and "goal" in info:
+        near = is_truly_near(task, info["true_pose"], info["goal"])
+        is_there = arrived & near.reshape(len(arrived), -1).all(axis=1)
+    true = "true_collision" if "true_collision" in info else "collision"
+    hit = np.asarray(_get_flags(info, true).any(axis=1))
+    return arrived, is_there, hit
 
 
 def _get_flags(info: dict[str, Any], name: str) -> Mask:
@@ -329,6 +352,15 @@ class Tally(Summary):
         return figures
 
 
+def _collect_outcomes(episodes: Sequence[Episode]) -> Outcomes:
+    rows = (
+        (e.seed, e.result, e.steps, e.length, e.reward, e.believed_success)
+        for e in episodes
+    )
+    seeds, results, *figures = map(np.array, zip(*rows, strict=True))
+    return Outcomes(seeds, results == "success", results == "collision", *figures)
+
+
 def tallies(
     runs: Mapping[str, Sequence[Episode]], control_period: float
 ) -> dict[str, Tally]:
@@ -336,20 +368,12 @@ def tallies(
     first = next(iter(runs.values()))
     by_place = {}
     for place, episodes in runs.items():
-        rows = (
-            (e.seed, e.result, e.steps, e.length, e.reward, e.believed_success)
-            for e in episodes
-        )
-        seeds, results, *figures = map(np.array, zip(*rows, strict=True))
-        outcomes = Outcomes(
-            seeds, results == "success", results == "collision", *figures
-        )
         pairs = list(zip(episodes, first, strict=True))
         gaps = [deviation(episode, reference) for episode, reference in pairs]
+        same = [episode.result == reference.result for episode, reference in pairs]
         by_place[place] = Tally(
-            **vars(summarise(outcomes, control_period)),
-            same=sum(episode.result == reference.result for episode, reference in pairs)
-            / len(pairs),
+            **vars(summarise(_collect_outcomes(episodes), control_period)),
+            same=sum(same) / len(same),
             deviation=estimate_mean(gaps),
             greatest_deviation=max(gaps),
         )

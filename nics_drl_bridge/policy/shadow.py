@@ -125,15 +125,20 @@ def shadow(
             f"{path}: no scan with matching odometry; see nics bag info."
         )
     if goal is None:
-        times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
-        places = np.array([moment.view.pose[:2] for moment in moments])
-        later = [np.interp(times + ahead_s, times, place) for place in places.T]
-        goals = np.stack(later, axis=-1)
+        goals = _find_later_places(moments, ahead_s)
     else:
         goals = np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
     return _compare_moments(
         moments, goals, policy, replace(model, lidar=playback.lidar)
     )
+
+
+def _find_later_places(moments: list[_Moment], ahead_s: float) -> Array:
+    """Returns where the robot was `ahead_s` after each moment (T, 2) [m]."""
+    times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
+    places = np.array([moment.view.pose[:2] for moment in moments])
+    later = [np.interp(times + ahead_s, times, place) for place in places.T]
+    return np.stack(later, axis=-1)
 
 
 def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:

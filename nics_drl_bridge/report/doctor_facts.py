@@ -14,7 +14,7 @@ from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.lidar.sectors import ScanLayout, make_reader, plan_of
+from nics_drl_bridge.lidar.sectors import ScanLayout, make_reader, make_sector_plan
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
 from nics_drl_bridge.policy.file.contract import Contract
 from nics_drl_bridge.recording import messages
@@ -253,5 +253,5 @@ def fit_lidar_to_header(
     Raises ConfigError if it does not fill the sectors of `scan`.
     """
     lidar = make_reader(layout.header, layout.beams, mounted).lidar
-    plan_of(lidar, scan)
+    make_sector_plan(lidar, scan)
     return lidar

@@ -47,7 +47,7 @@ class Terms(NamedTuple):
     drag: Array  # (S,) drag, which slows a state by its square [1 / (unit s)]
     curves: Array  # (C, 4) input curves of the commands
     # (C,) delays of commands beyond their common latency [steps]
-    late: NDArray[np.int64]
+    extra_delays: NDArray[np.int64]
     emf: Array  # (S, C) back-EMF per state and size of a command; (0, 0) if all are 0
 
 
@@ -91,7 +91,7 @@ def make_terms(model: TaylorModel) -> Terms:
         friction=np.asarray(model.friction, np.float64),
         drag=np.asarray(model.drag, np.float64),
         curves=_make_curves(model),
-        late=np.round(model.delays / model.dt).astype(np.int64),
+        extra_delays=np.round(model.delays / model.dt).astype(np.int64),
         emf=model.back_emf if model.back_emf.any() else np.zeros((0, 0)),
     )
 
@@ -180,7 +180,7 @@ def replace_coefficients(terms: Terms, coefficient: Array) -> Terms:
         terms.friction,
         terms.drag,
         terms.curves,
-        terms.late,
+        terms.extra_delays,
         terms.emf,
     )
 

@@ -29,10 +29,10 @@ from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import (
     Array,
     BodyCells,
+    ContactScratch,
     Integers,
     Record,
     Surroundings,
-    Tight,
 )
 
 # Bit flags for what a robot may touch
@@ -65,7 +65,7 @@ class ContactWorld(NamedTuple):
     velocity: Array  # (K, 3) of the obstacles
     first: int  # index of the first robot
     scene: Surroundings
-    tight: Tight
+    scratch: ContactScratch
     touched: Array  # (M,) 1 for robots that have touched something in this episode
     series: Array  # see `robot.kernels`
     period: float  # [s]
@@ -105,17 +105,17 @@ def find_near(
                 near[m, 1 + i] = k
             count += 1
     near[m, 0] = count
-    meets = BODIES if count > 0 else FREE
+    may_touch = BODIES if count > 0 else FREE
     for w in range(len(walls)):
         if collision.wall_distance2(x, y, walls[w]) <= own_reach * own_reach:
-            meets |= WALLS
+            may_touch |= WALLS
             break
     if (
         collision.map_bound(bodies[n, me], scene.grid)
         <= own_reach - bodies[n, me, RADIUS]
     ):
-        meets |= MAP  # without a map, the bound is inf
-    return meets
+        may_touch |= MAP  # without a map, the bound is inf
+    return may_touch
 
 
 @kernel
@@ -123,15 +123,15 @@ def advance(
     begin: float, duration: float, obstacles_move: bool, world: ContactWorld
 ) -> None:
     """Move the obstacles and the robots that may touch something for a duration [s]."""
-    meets = world.tight.meets
-    motions = world.tight.motions
-    robots = len(meets)
+    may_touch = world.scratch.may_touch
+    motions = world.scratch.motions
+    robots = len(may_touch)
     fastest = _find_fastest(obstacles_move, world)
-    world.tight.fastest[0] = fastest
+    world.scratch.fastest[0] = fastest
     # Robots that are due at nearly the same time are judged together: there are fewer steps.
     tolerance = np.inf
     for m in range(robots):
-        if meets[m] != FREE:
+        if may_touch[m] != FREE:
             speed = motions[m].bound + fastest
             # An earlier interval may have left more clearance than this one can use up.
             is_far = motions[m].room > speed * duration
@@ -142,20 +142,20 @@ def advance(
     while time < duration:
         end = duration
         for m in range(robots):
-            if meets[m] != FREE:
+            if may_touch[m] != FREE:
                 if motions[m].safe_until <= time + tolerance:
                     _choose_motion(m, begin, time, duration - time, world)
                 end = min(end, motions[m].safe_until)
         if obstacles_move:
             place_obstacles(begin + end, world)
         for m in range(robots):
-            if meets[m] != FREE:
+            if may_touch[m] != FREE:
                 _place_robot(motions[m], world.bodies[world.first + m], end, world)
         is_halted = True
         while is_halted:  # robots that would overlap something
             is_halted = False
             for m in range(robots):
-                if meets[m] != FREE and motions[m].is_close:
+                if may_touch[m] != FREE and motions[m].is_close:
                     is_halted |= _halt(m, begin, time, end, world)
         time = end
 
@@ -166,16 +166,16 @@ def _find_fastest(obstacles_move: bool, world: ContactWorld) -> float:
 
     A single robot only touches obstacles; one of several may also touch another robot.
     """
-    meets = world.tight.meets
+    may_touch = world.scratch.may_touch
     fastest = 0.0
     for k in range(world.first if obstacles_move else 0):
         vx = world.velocity[k, 0]
         vy = world.velocity[k, 1]
         rim = abs(world.velocity[k, 2]) * world.bodies[k, RADIUS]
         fastest = max(fastest, math.sqrt(vx * vx + vy * vy) + rim)
-    for m in range(len(meets) if len(meets) > 1 else 0):
-        if meets[m] != FREE:
-            fastest = max(fastest, world.tight.motions[m].bound)
+    for m in range(len(may_touch) if len(may_touch) > 1 else 0):
+        if may_touch[m] != FREE:
+            fastest = max(fastest, world.scratch.motions[m].bound)
     return fastest
 
 
@@ -185,18 +185,18 @@ def find_contacts(
 ) -> tuple[float, int]:
     """Return a robot's clearance, up to `limit` [m], and the nearest body or -1.
 
-    Touches within `skin` [m] are listed in `world.tight.listed`.
+    Touches within `skin` [m] are listed in `world.scratch.listed`.
     """
     scene = world.scene
-    near = world.tight.near
-    meets = world.tight.meets[m]
-    listed = world.tight.listed
+    near = world.scratch.near
+    may_touch = world.scratch.may_touch[m]
+    listed = world.scratch.listed
     me = world.first + m
     body = collision.solid_of(me, world.bodies[me], scene.outlines)
     least = limit
     whom = -1
     listed.number[0] = 0
-    if meets & BODIES:
+    if may_touch & BODIES:
         is_listed = near[m, 0] <= SEVERAL
         for i in range(near[m, 0] if is_listed else len(world.bodies)):
             k = near[m, 1 + i] if is_listed else i
@@ -208,9 +208,9 @@ def find_contacts(
                 least = gap
                 whom = k
     to_bodies = least
-    if meets & WALLS:
+    if may_touch & WALLS:
         least = collision.wall_gap(body, scene.walls, least, skin, listed)
-    if meets & MAP:
+    if may_touch & MAP:
         least = collision.map_gap(body, scene.grid, least, skin, listed)
     return least, whom if least == to_bodies else -1
 
@@ -220,7 +220,7 @@ def start_motion(
     m: int, vx: float, vy: float, turn: float, world: ContactWorld
 ) -> None:
     """Start the motion of a robot with a twist, at the beginning of an interval."""
-    motion = world.tight.motions[m]
+    motion = world.scratch.motions[m]
     body = world.bodies[world.first + m]
     motion.wish_x = vx
     motion.wish_y = vy
@@ -285,9 +285,9 @@ def _place_robot(motion: Record, body: Array, time: float, world: ContactWorld) 
 def place_obstacles(time: float, world: ContactWorld) -> None:
     """Place the obstacles at their poses at a time in the period."""
     for k in range(world.first):
-        lasted = min(time, world.tight.stops[k])
+        lasted = min(time, world.scratch.stops[k])
         _place_obstacle(
-            world.bodies[k], world.tight.start[k], world.velocity[k], lasted
+            world.bodies[k], world.scratch.start[k], world.velocity[k], lasted
         )
 
 
@@ -310,13 +310,13 @@ def _find_approach(time: float, touch: Record, world: ContactWorld) -> float:
         return 0.0
     body = world.bodies[k]
     if k < world.first:
-        if time >= world.tight.stops[k]:
+        if time >= world.scratch.stops[k]:
             return 0.0
         vx = world.velocity[k, 0]
         vy = world.velocity[k, 1]
         turn = world.velocity[k, 2]
     else:
-        motion = world.tight.motions[k - world.first]
+        motion = world.scratch.motions[k - world.first]
         vx = body[COS] * motion.vx - body[SIN] * motion.vy
         vy = body[SIN] * motion.vx + body[COS] * motion.vy
         turn = motion.turn
@@ -329,8 +329,8 @@ def _choose_motion(
     m: int, begin: float, time: float, rest: float, world: ContactWorld
 ) -> None:
     """Choose a robot's further motion, and the time until it may touch something."""
-    motion = world.tight.motions[m]
-    fastest = world.tight.fastest[0]
+    motion = world.scratch.motions[m]
+    fastest = world.scratch.fastest[0]
     _measure_clearance(m, begin, time, rest, world)
     _stop_obstacles(m, begin + time, world)
     if motion.freedom == MOVE:
@@ -338,7 +338,7 @@ def _choose_motion(
     body = world.bodies[world.first + m]
     speed = _bound_speed(body, motion.vx, motion.vy, motion.turn, world)
     motion.safe_until = time + max(motion.gap, FLOOR) / (speed + fastest)
-    if world.tight.listed.number[0] > 0:
+    if world.scratch.listed.number[0] > 0:
         pushed_until = time + FLOOR / (SPRING * motion.bound)
         motion.safe_until = min(motion.safe_until, pushed_until)
 
@@ -352,8 +352,8 @@ def _measure_clearance(
     The clearance is measured as far as the robot may get in the rest of the period, so
     that `room` may show that it need not be judged in later intervals.
     """
-    motion = world.tight.motions[m]
-    speed = motion.bound + world.tight.fastest[0]
+    motion = world.scratch.motions[m]
+    speed = motion.bound + world.scratch.fastest[0]
     limit = max(speed * max(rest, world.period - begin - time), SKIN)
     gap, whom = find_contacts(m, limit, SKIN, world)
     if gap < -collision.OVERLAP:
@@ -369,11 +369,11 @@ def _stop_obstacles(m: int, time: float, world: ContactWorld) -> None:
 
     Nothing pushes a robot: an obstacle stops, and another robot deflects its own motion.
     """
-    listed = world.tight.listed
+    listed = world.scratch.listed
     for touch in listed.touches[: listed.number[0]]:
         approach = _find_approach(time, touch, world)
         if 0 <= touch.other < world.first and approach > 0.0:
-            world.tight.stops[touch.other] = time
+            world.scratch.stops[touch.other] = time
             _mark(m, touch.other, world)
         touch.recedes = min(approach, 0.0)
 
@@ -386,7 +386,7 @@ def _deflect(m: int, time: float, world: ContactWorld) -> None:
         stop a ring there: the robot slides without friction, and a touched corner turns
         it.
     """
-    motion = world.tight.motions[m]
+    motion = world.scratch.motions[m]
     body = world.bodies[world.first + m]
     c = body[COS]
     s = body[SIN]
@@ -395,7 +395,7 @@ def _deflect(m: int, time: float, world: ContactWorld) -> None:
     turn = motion.wish_turn
     inertia = body[RADIUS] * body[RADIUS]
     is_bent = False
-    listed = world.tight.listed
+    listed = world.scratch.listed
     for sweep in range(SWEEPS):
         is_done = True
         for touch in listed.touches[: listed.number[0]]:
@@ -440,13 +440,13 @@ def _halt(m: int, begin: float, time: float, end: float, world: ContactWorld) ->
     Returns:
         True if it did either.
     """
-    motion = world.tight.motions[m]
+    motion = world.scratch.motions[m]
     gap, whom = find_contacts(m, 0.0, 0.0, world)
     if gap >= min(motion.gap, 0.0):
         return False
     if motion.freedom == STAND:
-        if 0 <= whom < world.first and world.tight.stops[whom] > begin + time:
-            world.tight.stops[whom] = begin + time
+        if 0 <= whom < world.first and world.scratch.stops[whom] > begin + time:
+            world.scratch.stops[whom] = begin + time
             place_obstacles(begin + end, world)
             return True
         return False

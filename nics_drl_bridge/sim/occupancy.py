@@ -68,12 +68,8 @@ def occupancy(
     if world.size is not None:  # occupy everything around the field
         centres = made.cell_to_world(_cell_indices(cells))
         cells[(np.abs(centres) > np.array(world.size) / 2.0).any(axis=-1)] = OCCUPIED
-    if world.grid is not None:  # each cell of the map becomes a square of smaller cells
-        parts = round(world.grid.resolution / made.resolution)
-        copied = world.grid.cells.repeat(parts, axis=0).repeat(parts, axis=1)
-        column, row = -frame.first
-        into = cells[row : row + copied.shape[0], column : column + copied.shape[1]]
-        into[:] = np.where(into == OCCUPIED, into, copied)
+    if world.grid is not None:
+        _copy_map(made, world.grid, frame)
     for wall in np.array(world.walls, np.float64).reshape(-1, 2, 2):
         index = made.world_to_cell(_along(wall, made.resolution))
         index = index[_is_within(index, cells)]
@@ -81,6 +77,15 @@ def occupancy(
     for shape, pose in obstacles:
         _fill(made, shape, np.asarray(pose, np.float64))
     return made
+
+
+def _copy_map(made: GridMap, grid: GridMap, frame: "_Frame") -> None:
+    """Copy a map: each of its cells becomes a square of smaller cells."""
+    parts = round(grid.resolution / made.resolution)
+    copied = grid.cells.repeat(parts, axis=0).repeat(parts, axis=1)
+    column, row = -frame.first
+    into = made.cells[row : row + copied.shape[0], column : column + copied.shape[1]]
+    into[:] = np.where(into == OCCUPIED, into, copied)
 
 
 class _Frame(NamedTuple):
@@ -96,11 +101,7 @@ class _Frame(NamedTuple):
 def _frame_of(world: World, cell: float) -> _Frame:
     """Choose the cells of a world, given the maximum side of a cell [m]."""
     grid = world.grid
-    ends = world.all_walls().reshape(-1, 2)
-    if world.size is not None or world.bounds is not None:
-        low_x, low_y, high_x, high_y = world.extent
-        field = [(low_x, low_y), (high_x, low_y), (high_x, high_y), (low_x, high_y)]
-        ends = np.concatenate([ends, field])
+    ends = _find_ends(world)
     pose: Any = grid.origin if grid is not None else (*ends.min(axis=0), 0.0)
     corners = rotate(ends - pose[:2], -pose[2])
     if grid is not None:
@@ -108,15 +109,22 @@ def _frame_of(world: World, cell: float) -> _Frame:
         corners = np.concatenate([corners, map_corners])
     low = corners.min(axis=0)
     high = corners.max(axis=0)
-    area = float(np.prod(high - low))
-    cell = max(cell, math.sqrt(area / MOST_CELLS))
-    if grid is not None:
-        parts = math.ceil(grid.resolution / cell - ROUNDING)
-        cell = grid.resolution / max(1, parts)
+    cell = max(cell, math.sqrt(float(np.prod(high - low)) / MOST_CELLS))
+    if grid is not None:  # its cells are divided evenly
+        cell = grid.resolution / max(1, math.ceil(grid.resolution / cell - ROUNDING))
     first = np.floor(low / cell + ROUNDING).astype(int) - 1
     end = np.ceil(high / cell - ROUNDING).astype(int) + 1
     columns, rows = end - first
     return _Frame(pose, first, (int(rows), int(columns)), cell)
+
+
+def _find_ends(world: World) -> Array:
+    """Return the ends of the walls and the corners of the field, if any (P, 2)."""
+    ends = world.all_walls().reshape(-1, 2)
+    if world.size is None and world.bounds is None:
+        return ends
+    x1, y1, x2, y2 = world.extent
+    return np.concatenate([ends, [(x1, y1), (x2, y1), (x2, y2), (x1, y2)]])
 
 
 def _cell_indices(cells: NDArray[Any]) -> NDArray[np.int_]:

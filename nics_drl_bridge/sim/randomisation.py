@@ -270,49 +270,44 @@ class Sampler:
             np.int64
         )
         noise = _between(self._noise, chosen, robots, ODOMETRY_GROUP)
-        faults = _between(self._faults, chosen, robots, LIDAR_GROUP)
         noise[..., 3] = noise[..., 2]
         coefficient = _between(self._coefficient, chosen, robots, KINEMATICS_GROUP)
         response = _between(self._response, chosen, robots, RESPONSE_GROUP)
         coefficient[..., self._rates] /= response
-        for column, values in self._choices.items():
-            drawn = _between(UNIT, chosen, robots, CHOICES_GROUP, column)[..., 0]
-            faults[..., column] = values[(drawn * len(values)).astype(np.int64)]
-        counts = self.randomisation.obstacles.count is not None
-        sizes = len(self._sizes) > 1
+        has_sizes = len(self._sizes) > 1
+        has_counts = self.randomisation.obstacles.count is not None
         return Draws(
             coefficient,
             response[..., 0],
             timing[..., 0].copy(),
             timing[..., 1].copy(),
             noise,
-            faults,
-            scene[:, 0] if counts else None,
-            scene[:, 1] if sizes else None,
-            self._sizes[scene[:, 1]] if sizes else None,
+            self._draw_faults(chosen),
+            scene[:, 0] if has_counts else None,
+            scene[:, 1] if has_sizes else None,
+            self._sizes[scene[:, 1]] if has_sizes else None,
             np.multiply(timing, self._step),
             self._labels,
         )
 
+    def _draw_faults(self, seeds: Integers) -> Array:
+        """Draw the faults of the lidars (n, M, P); options of a list are equally likely."""
+        faults = _between(self._faults, seeds, self._robots, LIDAR_GROUP)
+        for column, values in self._choices.items():
+            drawn = _between(UNIT, seeds, self._robots, CHOICES_GROUP, column)[..., 0]
+            faults[..., column] = values[(drawn * len(values)).astype(np.int64)]
+        return faults
+
     def _name(self, model: SimulatorModel) -> Iterator[Label]:
-        kept = zip(*np.nonzero(model.kinematics.coefficients), strict=True)
-        terms = [
-            f"kinematics.{model.kinematics.dofs[d]}.{model.kinematics.term_names[k]}"
-            for d, k in kept
-        ]
-        noise = [name and f"odometry.{name}" for name in NOISE_NAMES]
-        noise += [
-            f"odometry.state_drift.{variable.name}" for variable in model.robot.state
-        ]
         for field, names, (low, high) in (
-            ("coefficient", terms, self._coefficient),
+            ("coefficient", _name_terms(model.kinematics), self._coefficient),
             ("latency", ["action_latency_s", "observation_latency_s"], self._timing),
-            ("noise", noise, self._noise),
+            ("noise", _name_noise(model), self._noise),
             ("faults", [f"lidar.{fault}" for fault in FAULT_COLUMNS], self._faults),
         ):
             for column, name in enumerate(names):
-                chosen = field == "faults" and column in self._choices
-                if name and (chosen or low[column] != high[column]):
+                is_chosen = field == "faults" and column in self._choices
+                if name and (is_chosen or low[column] != high[column]):
                     yield name, field, column
         if self._response[0] != self._response[1]:
             yield "kinematics.response", "response", None
@@ -320,6 +315,19 @@ class Sampler:
             yield "obstacles.count", "count", None
         if len(self._sizes) > 1:
             yield "obstacles.size", "scale", None
+
+
+def _name_terms(model: TaylorModel) -> list[str]:
+    """Return the names of the kept terms, in the order of `robot.kernels.Terms`."""
+    kept = zip(*np.nonzero(model.coefficients), strict=True)
+    return [f"kinematics.{model.dofs[d]}.{model.term_names[k]}" for d, k in kept]
+
+
+def _name_noise(model: SimulatorModel) -> list[str | None]:
+    """Return the names of the columns of `State.noise`; None for one that is a copy."""
+    odometry = [name and f"odometry.{name}" for name in NOISE_NAMES]
+    states = [f"odometry.state_drift.{state.name}" for state in model.robot.state]
+    return [*odometry, *states]
 
 
 def _between(
@@ -339,33 +347,7 @@ def _between(
 
 
 def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bounds:
-    spans = np.tile(ranges.scale, (*model.coefficients.shape, 1))
-    for key, named in (("dofs", ranges.dofs), ("terms", ranges.terms)):
-        place = f"{where}: key 'kinematics.{key}'"
-        for dof in named:
-            if dof not in model.dofs:
-                raise ConfigError(
-                    f"{place}: unknown rate {dof!r}; {suggest(dof, model.dofs)}"
-                )
-    for dof, span in ranges.dofs.items():
-        spans[model.dofs.index(dof)] = span
-    for dof, terms in ranges.terms.items():
-        d = model.dofs.index(dof)
-        place = f"{where}: key 'kinematics.terms', rate {dof!r}"
-        known = {model.term_names[k]: k for k in np.flatnonzero(model.coefficients[d])}
-        for term, span in terms.items():
-            name = term
-            with suppress(ValueError):
-                powers = taylor.parse_term(term, model.variables)
-                name = taylor.format_term(powers, model.variables)
-            if name not in known:
-                hint = "the rate has no terms; remove the key."
-                if known:
-                    hint = suggest(term, known)
-                raise ConfigError(
-                    f"{place}: the model has no term {term!r} there; {hint}"
-                )
-            spans[d, known[name]] = span
+    spans = _find_spans(ranges, model, where)
     if ranges.response != AS_IT_IS and not model.state_size:
         raise ConfigError(
             f"{where}: key 'kinematics.response': the model has no state, so it has no time "
@@ -377,6 +359,42 @@ def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bo
     kept = np.nonzero(model.coefficients)
     base = make_terms(model).coefficient
     return base * spans[kept][:, 0], base * spans[kept][:, 1]
+
+
+def _find_spans(ranges: KinematicRanges, model: TaylorModel, where: str) -> Array:
+    """Return the range of the factor on each coefficient, (3 + S, terms, 2)."""
+    spans = np.tile(ranges.scale, (*model.coefficients.shape, 1))
+    for key, named in (("dofs", ranges.dofs), ("terms", ranges.terms)):
+        for dof in named:
+            if dof not in model.dofs:
+                hint = suggest(dof, model.dofs)
+                place = f"{where}: key 'kinematics.{key}'"
+                raise ConfigError(f"{place}: unknown rate {dof!r}; {hint}")
+    for dof, span in ranges.dofs.items():
+        spans[model.dofs.index(dof)] = span
+    for dof, terms in ranges.terms.items():
+        d = model.dofs.index(dof)
+        for term, span in terms.items():
+            spans[d, _find_term(term, d, model, where)] = span
+    return spans
+
+
+def _find_term(term: str, d: int, model: TaylorModel, where: str) -> int:
+    """Return the number of a term of rate d. Raises ConfigError if the model has none."""
+    known = {model.term_names[k]: k for k in np.flatnonzero(model.coefficients[d])}
+    name = term
+    with suppress(ValueError):
+        powers = taylor.parse_term(term, model.variables)
+        name = taylor.format_term(powers, model.variables)
+    if name in known:
+        return int(known[name])
+    hint = "the rate has no terms; remove the key."
+    if known:
+        hint = suggest(term, known)
+    raise ConfigError(
+        f"{where}: key 'kinematics.terms', rate {model.dofs[d]!r}: the model has no "
+        f"term {term!r} there; {hint}"
+    )
 
 
 def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.kernels import pack
-from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers
+from nics_drl_bridge.lidar.arrays import Array, Integers, Mask, ShortIntegers
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.shapes import (
     BODY,
@@ -117,19 +117,7 @@ class MemberSampler:
         try:
             scratch = self.scratches.pop()
         except IndexError:
-            cells, count = self.room
-            scratch = SceneScratch(
-                np.zeros(1, kernels.DRAWS),
-                np.zeros(cells, np.int64),
-                np.zeros(cells, np.int64),
-                np.zeros(1, np.int64),
-                np.zeros(count, np.bool_),
-                np.zeros(count),
-                np.zeros(BODY),
-                np.zeros(BODY),
-                allocate_touches(),
-                body_cells(1, count),
-            )
+            scratch = _allocate_scratch(*self.room)
         numbers, wanted, sizes = (values[rows] for values in draws)
         into = scenes.bodies[rows], scenes.starts[rows], scenes.goals[rows]
         drawn, why = kernels.draw_scenes(
@@ -152,6 +140,22 @@ class MemberSampler:
             f"with a path between them, {self.count} obstacles, {scene}; change `goal_distance`, "
             "lower `clearance` or `obstacles`, or enlarge the field."
         )
+
+
+def _allocate_scratch(cells: int, count: int) -> SceneScratch:
+    """Allocate the memory to draw scenes of at most so many cells and obstacles."""
+    return SceneScratch(
+        np.zeros(1, kernels.DRAWS),
+        np.zeros(cells, np.int64),
+        np.zeros(cells, np.int64),
+        np.zeros(1, np.int64),
+        np.zeros(count, np.bool_),
+        np.zeros(count),
+        np.zeros(BODY),
+        np.zeros(BODY),
+        allocate_touches(),
+        body_cells(1, count),
+    )
 
 
 class SceneSampler:
@@ -181,16 +185,13 @@ class SceneSampler:
             MemberSampler(member, footprint_radius, robots, most, catalogue)
             for member in world.members
         ]
-        scratches = self.samplers[0].scratches
-        rooms = [sampler.room for sampler in self.samplers]
-        room = tuple(max(parts) for parts in zip(*rooms, strict=True))
-        for sampler in self.samplers:
-            sampler.room = room
-            sampler.scratches = scratches
-        drawn = max(sampler.count for sampler in self.samplers)
+        cells, count = np.max([sampler.room for sampler in self.samplers], axis=0)
+        for sampler in self.samplers:  # they share their scratch memory
+            sampler.room = int(cells), int(count)
+            sampler.scratches = self.samplers[0].scratches
         self.robots = robots
         self._sizes = len(sizes)
-        self.count = drawn + len(world.spare)
+        self.count = int(count) + len(world.spare)
         # spare shapes come last
         self.shapes = (*catalogue.shapes, *world.spare)
 
@@ -305,20 +306,9 @@ def _plan(
     if alike not in catalogue.spaces:
         catalogue.spaces[alike] = _free_space(world, footprint, drawn)
     space = catalogue.spaces[alike]
-    outlines = catalogue.outlines
-    groups = np.zeros(len(world.obstacles), kernels.GROUP)
-    choices: list[int] = []
+    groups, choices = _tabulate_groups(world, catalogue)
     poses = np.zeros((len(slots), 3))
     for g, group in enumerate(world.obstacles):
-        groups[g] = (
-            *group.counts,
-            group.gap,
-            len(choices),
-            len(group.shapes),
-            bool(group.at),
-            group.motion is not None,
-        )
-        choices += [catalogue.place[shape] for shape in group.shapes]
         if group.at:
             poses[np.flatnonzero(np.equal(slots, g))] = group.at
     least, greatest = world.goal_distance
@@ -326,11 +316,11 @@ def _plan(
     around = world.goals is None and ring < len(space.for_robots) * space.cells.cell**2
     return ScenePlan(
         space,
-        outlines.arguments,
-        outlines.radii,
+        catalogue.outlines.arguments,
+        catalogue.outlines.radii,
         groups,
         np.array(slots, np.int64),
-        np.array(choices, np.int64),
+        choices,
         np.arange(len(catalogue.shapes)).reshape(-1, max(len(catalogue.place), 1)),
         poses,
         _places(world.starts),
@@ -341,6 +331,23 @@ def _plan(
         greatest,
         around,
     )
+
+
+def _tabulate_groups(world: World, catalogue: Catalogue) -> tuple[Records, Integers]:
+    """Return the groups (G,) of `kernels.GROUP`, and the shapes of one after the other."""
+    groups = np.zeros(len(world.obstacles), kernels.GROUP)
+    choices: list[int] = []
+    for g, group in enumerate(world.obstacles):
+        groups[g] = (
+            *group.counts,
+            group.gap,
+            len(choices),
+            len(group.shapes),
+            bool(group.at),
+            group.motion is not None,
+        )
+        choices += [catalogue.place[shape] for shape in group.shapes]
+    return groups, np.array(choices, np.int64)
 
 
 def _places(places: Starts | Goals | None) -> Records:
@@ -362,18 +369,40 @@ def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
     cells = _cells_of(world) if world.grid is None else grid
     cells = cells._replace(distances=np.array(cells.distances, order="C"))
     walls = world.all_walls()
-    bounds = np.array([-np.inf, -np.inf, np.inf, np.inf])
     kernels.wall_distances(cells, walls)
+    bounds = np.array([-np.inf, -np.inf, np.inf, np.inf])
     if world.size is not None or world.bounds is not None:
         bounds = np.array(world.extent)
-        x, y = _centres(cells)
-        inside = (x > bounds[0]) & (x < bounds[2]) & (y > bounds[1]) & (y < bounds[3])
-        cells.distances[~inside] = 0.0
+        cells.distances[~_find_inside(bounds, *_centres(cells))] = 0.0
     # Between two cell centres the path may be closer to a corner than at either end.
     room = math.hypot(footprint + world.clearance, cells.cell / 2.0)
-    area, _ = ndimage.label(cells.distances >= room)
+    area = _find_areas(world, footprint, cells, room)
+    for key, places in (("starts", world.starts), ("goals", world.goals)):
+        _check(world, key, places, area, cells)
+    for_robots = anywhere = np.zeros(0, np.int32)
+    if world.starts is None or world.goals is None:
+        for_robots = np.flatnonzero(area).astype(np.int32)
+    if drawn:
+        anywhere = np.flatnonzero(cells.distances > 0.0).astype(np.int32)
+    return FreeSpace(cells, area, bounds, walls, grid, for_robots, anywhere, room)
+
+
+def _find_inside(bounds: Array, x: Array, y: Array) -> Mask:
+    """Return True for points inside of bounds, not on them."""
+    inside = (x > bounds[0]) & (x < bounds[2]) & (y > bounds[1]) & (y < bounds[3])
+    return np.asarray(inside)
+
+
+def _find_areas(
+    world: World, footprint: float, cells: MapField, room: float
+) -> ShortIntegers:
+    """Number the connected cells with a clearance of `room` [m], where goals are far enough.
+
+    Raises ConfigError if there are none.
+    """
     robot = f"a robot of radius {footprint:g} m with {world.clearance:g} m around it"
     least = world.goal_distance[0]
+    area, _ = ndimage.label(cells.distances >= room)
     if not area.any():
         raise ConfigError(
             f"{world.source}: key 'clearance': no free space for {robot}; lower `clearance`, "
@@ -385,16 +414,7 @@ def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
             f"{world.source}: key 'goal_distance': {robot} can't reach any goal {least:g} m "
             "away; lower `goal_distance` or `clearance`, or enlarge the world."
         )
-    for key, places in (("starts", world.starts), ("goals", world.goals)):
-        _check(world, key, places, area, cells)
-    nothing = np.zeros(0, np.int32)
-    for_robots = nothing
-    if world.starts is None or world.goals is None:
-        for_robots = np.flatnonzero(area).astype(np.int32)
-    anywhere = nothing
-    if drawn:
-        anywhere = np.flatnonzero(cells.distances > 0.0).astype(np.int32)
-    return FreeSpace(cells, area, bounds, walls, grid, for_robots, anywhere, room)
+    return area
 
 
 def _closed(grid: GridMap) -> MapField:
@@ -439,22 +459,25 @@ def _check(
     area: ShortIntegers,
     cells: MapField,
 ) -> None:
-    if places is None:
-        return
+    for place, value, fits in [] if places is None else _judge(places, area, cells):
+        if not fits:
+            robot = f"a robot with {world.clearance:g} m around it does not fit there, at {value}"
+            raise ConfigError(
+                f"{world.source}: key '{key}.{place}': {robot}; move it, or lower `clearance`."
+            )
+
+
+def _judge(
+    places: Starts | Goals, area: ShortIntegers, cells: MapField
+) -> Iterator[tuple[str, list[float], bool]]:
+    """Yield the key and value of each region or pose, and whether a robot fits there."""
     x, y = _centres(cells)[:, area > 0]
-    fits = {}
     for number, region in enumerate(places.regions):
         x1, x2 = sorted(region[::2])
         y1, y2 = sorted(region[1::2])
         within = (x >= x1) & (x <= x2) & (y >= y1) & (y <= y2)
-        fits[f"{key}.regions.{number}"] = bool(within.any()), list(region)
+        yield f"regions.{number}", list(region), bool(within.any())
     for number, at in enumerate(places.at):
         i, j, _ = kernels.cell_of(at[0], at[1], cells)
         inside = 0 <= i < area.shape[0] and 0 <= j < area.shape[1]
-        fits[f"{key}.at.{number}"] = inside and bool(area[i, j]), list(at)
-    for place, (free, value) in fits.items():
-        if not free:
-            robot = f"a robot with {world.clearance:g} m around it does not fit there, at {value}"
-            raise ConfigError(
-                f"{world.source}: key {place!r}: {robot}; move it, or lower `clearance`."
-            )
+        yield f"at.{number}", list(at), inside and bool(area[i, j])

@@ -497,17 +497,24 @@ def read_sdf(
     )
     shapes = seen - sum(map(len, unknown.values()))
     if left_out and not (skip_unknown and (shapes or may_be_empty)):
-        fix = "put a box in its place"
-        if not skip_unknown:
-            fix = f"leave it out by --skip-unknown or --without MODEL, or {fix}"
-        more = f" (as do {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
-        reason = f"{left_out[0]}{more}, which a world can't contain"
-        is_missing = next(iter(unknown)) in missing
-        raise AssetsError(path, f": {reason}; {fix}.", is_missing)
+        raise AssetsError(
+            path,
+            f": {_explain_left_out(left_out, skip_unknown)}",
+            next(iter(unknown)) in missing,
+        )
     if not placed and not may_be_empty:
         reason = f"none of its {shapes} collision geometries is at height {height:g} m"
         raise SdfError(path, f": {reason}; choose another --height.")
     return Standing(tuple(placed), left_out, bool(missing))
+
+
+def _explain_left_out(left_out: tuple[str, ...], skip_unknown: bool) -> str:
+    """Return what is wrong with the first of some models, and the fix."""
+    fix = "put a box in its place"
+    if not skip_unknown:
+        fix = f"leave it out by --skip-unknown or --without MODEL, or {fix}"
+    more = f" (as do {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
+    return f"{left_out[0]}{more}, which a world can't contain; {fix}."
 
 
 def _section_of(body: "_Body", height: float) -> Placed | None:
@@ -605,19 +612,20 @@ def _found(uri: str, file: Path) -> Path | None:
         path = parent / name
         if name and path.is_file():
             return path
-        if not (name and path.is_dir()):
-            continue
-        # the SDF of the newest version
-        config = path / "model.config"
-        versions: list[Element] = []
-        if config.is_file():
-            versions += _tree(config).iterfind("sdf")
-        newest = max(
-            versions, key=lambda sdf: _version(sdf.get("version", "")), default=None
-        )
-        found = path / ("model.sdf" if newest is None else (newest.text or "").strip())
-        return found if found.is_file() else None
+        if name and path.is_dir():
+            found = _find_newest(path)
+            return found if found.is_file() else None
     return None
+
+
+def _find_newest(folder: Path) -> Path:
+    """Return the SDF of the newest version in the folder of a model."""
+    config = folder / "model.config"
+    versions = list(_tree(config).iterfind("sdf")) if config.is_file() else []
+    newest = max(
+        versions, key=lambda sdf: _version(sdf.get("version", "")), default=None
+    )
+    return folder / ("model.sdf" if newest is None else (newest.text or "").strip())
 
 
 def _version(text: str) -> tuple[int, ...]:

@@ -84,7 +84,7 @@ class Sizes:
 
     def count_history_rows(self, model: SimulatorModel) -> int:
         """Return H: one row for the newest command and one per period of delay."""
-        own_delays = make_terms(model.kinematics).late
+        own_delays = make_terms(model.kinematics).extra_delays
         longest = self.longest_delay + int(own_delays.max(initial=0))
         return count_periods(longest, model) + 1
 
@@ -111,9 +111,9 @@ class CommandRange:
         self,
         model: taylor.TaylorModel,
         robot: RobotSpec,
-        tell: Callable[[str], None] = warn_caller,
+        warn: Callable[[str], None] = warn_caller,
     ) -> None:
-        self._tell = tell
+        self._warn = warn
         self._names = robot.variable_names[model.state_size :]
         fitted = np.stack([model.low, model.high])[:, model.state_size :]
         # The model's range refers to commands in effect; `check` gets the commands as
@@ -148,7 +148,7 @@ class CommandRange:
             lowest = flat[:, c].min()
             value = lowest if lowest < self._low[c] else flat[:, c].max()
             low, high = self._fitted[:, c]
-            self._tell(
+            self._warn(
                 f"{name} is {value:.4g}, but the model was fitted to {low:.4g} to {high:.4g} only: "
                 "its motion there is extrapolated; record a drive that covers it."
             )
@@ -211,7 +211,7 @@ class FastSimulator:
         randomisation: str | Randomisation | None = None,
         longest_delay: int | None = None,
         longest_age: int = 0,
-        tell: Callable[[str], None] = warn_caller,
+        warn: Callable[[str], None] = warn_caller,
     ) -> None:
         """Allocate the worlds; `reset` begins their first episodes.
 
@@ -227,7 +227,7 @@ class FastSimulator:
                 model's delay, or the maximum of the randomisation if that is longer.
             longest_age: upper limit of `data.age` [substeps]; raised to the
                 randomisation's maximum in the same way.
-            tell: called with a message when a command leaves the fitted range, once per
+            warn: called with a message when a command leaves the fitted range, once per
                 command.
 
         Raises:
@@ -275,7 +275,7 @@ class FastSimulator:
         edges = np.arange(min(threads, worlds) + 1) * worlds // min(threads, worlds)
         self.parts = tuple(slice(*ends) for ends in itertools.pairwise(edges.tolist()))
         self._command_shape = (robots, len(model.robot.command))
-        self._command_range = CommandRange(model.kinematics, model.robot, tell)
+        self._command_range = CommandRange(model.kinematics, model.robot, warn)
 
     def reset(
         self,
@@ -327,13 +327,7 @@ class FastSimulator:
         )
         self.goals[chosen] = scenes.goals
         if draws is not None:
-            for name in ("coefficient", "noise", "delay", "age", "faults"):
-                getattr(data, name)[chosen] = getattr(draws, name)
-            for name, values in draws.named().items():
-                if name not in self.drawn:
-                    shape = (len(data.steps), *values.shape[1:])
-                    self.drawn[name] = np.zeros(shape, values.dtype)
-                self.drawn[name][chosen] = values
+            self._put_draws(draws, chosen)
         for part in self.parts:
             of_part = chosen[(chosen >= part.start) & (chosen < part.stop)]
             if len(of_part):
@@ -344,6 +338,16 @@ class FastSimulator:
         return Scenes(
             self.obstacles_of(chosen), scenes.starts, scenes.goals, scenes.member
         )
+
+    def _put_draws(self, draws: Draws, chosen: Integers) -> None:
+        """Give some worlds (n,) the numbers that were drawn for them."""
+        for name in ("coefficient", "noise", "delay", "age", "faults"):
+            getattr(self.data, name)[chosen] = getattr(draws, name)
+        for name, values in draws.named().items():
+            if name not in self.drawn:
+                shape = (len(self.data.steps), *values.shape[1:])
+                self.drawn[name] = np.zeros(shape, values.dtype)
+            self.drawn[name][chosen] = values
 
     def step(self, commands: ArrayLike) -> None:
         """Advance every world by one control period under commands (N, M, C)."""
@@ -506,21 +510,17 @@ class FastSimulator:
         motions = self.sampler.motions
         crowded = self._sizes.crowded
         grids = _share_equal_maps([world.grid for world in members])
-        distances, places = joined([map_field(grid).distances for grid in grids])
-        moves = any(motion is not None for group in motions for motion in group)
-        standing = not (crowded or moves) and self.sampler.count >= STANDING
-        plans, waypoints = _stack_plans(motions if moves else [() for _ in members])
-        walls = [world.all_walls() for world in members]
+        moves = any(map(any, motions))
         return WorldSetArrays(
-            stack_fixtures(walls, grids, self.data.member),
-            distances,
-            places,
+            stack_fixtures(
+                [world.all_walls() for world in members], grids, self.data.member
+            ),
+            *joined([map_field(grid).distances for grid in grids]),
             self._scanner.table.outlines.arguments,
             crowded,
-            standing,
+            not (crowded or moves) and self.sampler.count >= STANDING,
             moves,
-            plans,
-            waypoints,
+            *_stack_plans(motions if moves else [()] * len(members)),
             np.array([world.extent for world in members]),
         )
 
@@ -731,14 +731,14 @@ def _allocate_scratch(
             coefficient=np.zeros((np.count_nonzero(kinematics.coefficients), lanes)),
         ),
         single=records.Single(*allocate_scratch(kinematics)),
-        tight=records.Tight(
+        contact=records.ContactScratch(
             motions=np.zeros(robots, records.MOTION),
             listed=records.allocate_touches(),
             start=np.zeros((obstacles, 3)),
             stops=np.zeros(obstacles),
             fastest=np.zeros(1),
             near=np.zeros((robots, 1 + SEVERAL), np.int64),
-            meets=np.zeros(robots, np.int64),
+            may_touch=np.zeros(robots, np.int64),
             reach=np.zeros(bodies),
             speeds=np.zeros((robots, 2)),
         ),

@@ -285,8 +285,8 @@ class Single(NamedTuple):
     dq: Array  # (3 + S,) rates
 
 
-class Tight(NamedTuple):
-    """Scratch memory of one world and its contacts, see `contact_kernels`."""
+class ContactScratch(NamedTuple):
+    """Scratch memory of the contacts in one world, see `contact_kernels`."""
 
     motions: Records  # (M,) of `MOTION`
     listed: Touches
@@ -294,7 +294,7 @@ class Tight(NamedTuple):
     stops: Array  # (K,) time in the period at which each obstacle stops [s]
     fastest: Array  # (1,) speed of the fastest other body [m/s]
     near: Integers  # (M, 1 + SEVERAL) number and indices of the bodies near each robot
-    meets: Integers  # (M,) bit flags of `contact_kernels`
+    may_touch: Integers  # (M,) flags of what each robot may touch in the period
     reach: Array  # (K + M,) maximum reach of each body from its current centre [m]
     speeds: Array  # (M, 2) velocity of the robots in `map` [m/s]
 
@@ -318,7 +318,7 @@ class Scratch(NamedTuple):
 
     lanes: Lanes
     single: Single
-    tight: Tight
+    contact: ContactScratch
     cells: BodyCells  # cells of all worlds, with the thread's own list `found`
     scans: Scans
 

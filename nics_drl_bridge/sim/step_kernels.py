@@ -209,7 +209,7 @@ def _begin_period_of_world(n: int, first_lane: int, part: Part) -> None:
     If an episode begins, also record its start, with the robots at rest.
     """
     data = part.data
-    speeds = part.scratch.tight.speeds
+    speeds = part.scratch.contact.speeds
     newest = data.steps[n] % data.past.shape[2]
     for m in range(data.pose.shape[1]):
         pose = data.pose[n, m]
@@ -296,16 +296,16 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
     data = part.data
     motion = part.motion
     lanes = part.scratch.lanes
-    start = part.scratch.tight.start
+    start = part.scratch.contact.start
     obstacles_move = _find_what_is_near(n, first_lane, scene, part)
     if obstacles_move:
         for k in range(len(start)):
             for i in range(3):
                 start[k, i] = data.bodies[n, k, i]
-    any_meets = False
+    any_may_touch = False
     for m in range(data.pose.shape[1]):
-        if part.scratch.tight.meets[m] != FREE:
-            any_meets = True
+        if part.scratch.contact.may_touch[m] != FREE:
+            any_may_touch = True
             continue
         lane = first_lane + m
         pose = data.pose[n, m]
@@ -322,7 +322,7 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
                 pose[0], pose[1], c, s, ahead, left, turn, 1.0, motion.series
             )
             pose[2] = robot.wrap(pose[2] + turn)
-    if any_meets:
+    if any_may_touch:
         _move_carefully(n, obstacles_move, scene, part)
     elif obstacles_move:
         period = motion.dt * motion.substeps
@@ -336,8 +336,8 @@ def _find_what_is_near(
     """Find what each robot may touch; return True if an obstacle moves."""
     data = part.data
     lane_poses = part.scratch.lanes.pose
-    tight = part.scratch.tight
-    reach = tight.reach
+    contact = part.scratch.contact
+    reach = contact.reach
     cells = part.scratch.cells
     first = data.velocity.shape[1]
     period = part.motion.dt * part.motion.substeps
@@ -369,8 +369,8 @@ def _find_what_is_near(
         sort_into_cells(n, data.bodies[n], data.bodies.shape[1], cells)
         cells.frame[n, MOVED] = longest
     for m in range(data.pose.shape[1]):
-        tight.meets[m] = contacts.find_near(
-            n, m, data.bodies, scene, tight.near, reach, cells
+        contact.may_touch[m] = contacts.find_near(
+            n, m, data.bodies, scene, contact.near, reach, cells
         )
     return obstacles_move
 
@@ -387,28 +387,28 @@ def _move_carefully(
     data = part.data
     motion = part.motion
     single = part.scratch.single
-    tight = part.scratch.tight
-    meets = tight.meets
-    stops = tight.stops
+    contact = part.scratch.contact
+    may_touch = contact.may_touch
+    stops = contact.stops
     period = motion.dt * motion.substeps
     world = ContactWorld(
         data.bodies[n],
         data.velocity[n],
         data.velocity.shape[1],
         scene,
-        tight,
+        contact,
         data.collided[n],
         motion.series,
         period,
     )
     stops[:] = period
-    for m in range(len(meets)):
-        if meets[m] != FREE:
+    for m in range(len(may_touch)):
+        if may_touch[m] != FREE:
             contacts.put_body(world.bodies[world.first + m], data.pose[n, m])
-            tight.motions[m].room = 0.0
+            contact.motions[m].room = 0.0
     for j in range(motion.substeps):
-        for m in range(len(meets)):
-            if meets[m] != FREE:
+        for m in range(len(may_touch)):
+            if may_touch[m] != FREE:
                 compute_rates(n, m, j, data, motion, single)
                 dq = single.dq
                 contacts.start_motion(m, dq[0], dq[1], dq[2], world)
@@ -420,15 +420,15 @@ def _move_carefully(
                     )
         contacts.advance(j * motion.dt, motion.dt, obstacles_move, world)
     drifts = False
-    for m in range(len(meets)):
-        if meets[m] != FREE:
+    for m in range(len(may_touch)):
+        if may_touch[m] != FREE:
             ahead, left, turn = draw_drift(n, m, data, motion)
             contacts.start_motion(m, ahead, left, turn, world)
             drifts = drifts or ahead != 0.0 or left != 0.0 or turn != 0.0
     if drifts:  # a displacement is a twist over one second; the obstacles stay
         contacts.advance(motion.substeps * motion.dt, 1.0, False, world)
-    for m in range(len(meets)):
-        if meets[m] != FREE:
+    for m in range(len(may_touch)):
+        if may_touch[m] != FREE:
             body = world.bodies[world.first + m]
             data.pose[n, m, 0] = body[X]
             data.pose[n, m, 1] = body[Y]
@@ -454,7 +454,7 @@ def compute_rates(
     for s in range(size):
         single.x[s] = data.state[n, m, s]
     for c in range(data.history.shape[3]):
-        delay = data.delay[n, m] + motion.terms.late[c]
+        delay = data.delay[n, m] + motion.terms.extra_delays[c]
         row = robot.find_delayed_command(j, delay, motion.substeps, sent)
         single.x[size + c] = data.history[n, m, row, c]
     robot.rates(
@@ -537,7 +537,7 @@ def move_freely(
                 lanes.coefficient[t, lane] = data.coefficient[n, m, t]
             # Each command changes once in a period, at this substep.
             for c in range(len(change)):
-                delay = data.delay[n, m] + motion.terms.late[c]
+                delay = data.delay[n, m] + motion.terms.extra_delays[c]
                 change[c, lane] = delay % substeps
     terms = robot.replace_coefficients(motion.terms, lanes.coefficient)
     substep = 0
@@ -551,7 +551,7 @@ def move_freely(
                 if change[c, lane] == substep or substep == 0:
                     n = first_world + lane // robots
                     m = lane % robots
-                    delay = data.delay[n, m] + motion.terms.late[c]
+                    delay = data.delay[n, m] + motion.terms.extra_delays[c]
                     row = robot.find_delayed_command(
                         substep, delay, substeps, data.history.shape[2]
                     )

@@ -340,7 +340,7 @@ def check_places(world: World) -> None:
         radius = max(shape.radius for shape in group.shapes)
         waypoints = group.motion.waypoints if isinstance(group.motion, Patrol) else ()
         for n, point in enumerate(waypoints):
-            if room_at(world, *point) < radius:
+            if measure_clearance(world, *point) < radius:
                 raise ConfigError(
                     f"{where}.motion.waypoints.{n}': an obstacle of radius {radius:g} m does not "
                     f"fit there, at {list(point)}; move it."
@@ -356,7 +356,7 @@ def check_place(
 ) -> None:
     """Raise ConfigError for a place off the field, or within a radius [m] of a wall."""
     solid = 0.0 if world.grid is None else world.grid.resolution  # in a full cell
-    room = room_at(world, x, y)
+    room = measure_clearance(world, x, y)
     if room <= max(radius, solid):
         reason = "is in a wall" if room >= 0.0 else "lies outside the world"
         x1, y1, x2, y2 = world.extent
@@ -371,7 +371,7 @@ def _inside(world: World, x: float, y: float) -> bool:
     return x1 <= x <= x2 and y1 <= y <= y2
 
 
-def room_at(world: World, x: float, y: float) -> float:
+def measure_clearance(world: World, x: float, y: float) -> float:
     """Free space around a point among walls and map [m], negative outside the world."""
     if not _inside(world, x, y):
         return -1.0

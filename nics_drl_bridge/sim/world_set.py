@@ -297,33 +297,28 @@ def _has_way(filled: Mask, parameters: Cellular) -> bool:
 
 
 def _world(filled: Mask, parameters: Cellular, number: int) -> World:
+    cell = parameters.cell
+    margin = parameters.margin
+    wide = parameters.columns * cell
+    deep = parameters.rows * cell
+    long = deep + 2.0 * margin
     rows, columns = np.nonzero(filled)
-    x = (columns + 0.5) * parameters.cell
-    y = parameters.margin + (rows + 0.5) * parameters.cell
-    wide = parameters.columns * parameters.cell
-    deep = parameters.rows * parameters.cell
-    long = deep + 2.0 * parameters.margin
-    middle = wide / 2.0
-    poses = [(px, py, 0.0) for px, py in np.round(np.stack([x, y], axis=1), 6).tolist()]
+    places = np.stack([(columns + 0.5) * cell, margin + (rows + 0.5) * cell], axis=1)
+    poses = tuple((x, y, 0.0) for x, y in np.round(places, 6).tolist())
+    obstacles: tuple[Obstacles, ...] = ()
     if poses:
-        cylinders = Obstacles(
-            shapes=(Circle(radius=parameters.cell / 2.0),), at=tuple(poses)
-        )
-    else:
-        cylinders = None
-    start = parameters.margin / 2.0
-    goal = long - parameters.margin / 2.0
+        obstacles = (Obstacles(shapes=(Circle(radius=cell / 2.0),), at=poses),)
     return World(
         name=f"cellular_{parameters.seed}_{number}",
         bounds=(0.0, 0.0, wide, long),
         clearance=0.0,
         walls=(
-            (0.0, 0.0, 0.0, parameters.margin + deep),
-            (wide, 0.0, wide, parameters.margin + deep),
+            (0.0, 0.0, 0.0, margin + deep),
+            (wide, 0.0, wide, margin + deep),
             (0.0, 0.0, wide, 0.0),
         ),
-        obstacles=(cylinders,) if cylinders else (),
+        obstacles=obstacles,
         goal_distance=(0.0, 2.0 * long),
-        starts=Starts(at=((middle, start, math.pi / 2.0),)),
-        goals=Goals(at=((middle, goal),)),
+        starts=Starts(at=((wide / 2.0, margin / 2.0, math.pi / 2.0),)),
+        goals=Goals(at=((wide / 2.0, long - margin / 2.0),)),
     )

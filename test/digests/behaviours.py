@@ -18,7 +18,7 @@ from nics_drl_bridge.sim.world import World
 
 from .projection import Found, joined
 
-PLANNED_ROBOTS = ("ackermann", "differential", "mecanum", "jackal")
+PLANNED_ROBOTS = ("ackermann", "jackal")
 PLANNED_STEPS = 60
 TRAINING = {
     "worlds": {"arena": 16},
@@ -27,7 +27,7 @@ TRAINING = {
     "hidden": [16, 16],
     "ppo": {"rollout": 32, "batch": 256, "epochs": 2},
 }
-ESTIMATED_ROBOTS = ("ackermann", "differential", "mecanum")
+ESTIMATED_ROBOTS = ("ackermann", "differential")
 ESTIMATED_PERIODS = 200
 PERIOD_NS = 100_000_000
 POSE_STD = np.array([0.02, 0.02, 0.02])  # of motion capture [m, m, rad]

@@ -19,13 +19,16 @@ class Driving(Navigation):
 
 
 ACTION = [0.3, -2.0, 0.1]
-WAYS_TO_SAY = {
-    "a list": ACTION,
-    "doubles": np.array(ACTION),
-    "floats": np.array(ACTION, np.float32),
-    "half floats": np.array(ACTION, np.float16),
-    "every second number": np.repeat(ACTION, 2)[::2],
-    "integers": np.array([1, -1, 0]),
+INTEGERS = [1, 0, 1]
+SAID = {
+    "a list": (ACTION, ACTION),
+    "doubles": (ACTION, np.array(ACTION)),
+    "every second number": (ACTION, np.repeat(ACTION, 2)[::2]),
+    "half floats": (INTEGERS, np.array(INTEGERS, np.float16)),
+    "bytes": (INTEGERS, np.array(INTEGERS, np.int8)),
+    "unsigned": (INTEGERS, np.array(INTEGERS, np.uint64)),
+    "flags": (INTEGERS, np.array(INTEGERS, np.bool_)),
+    "a list of integers": (INTEGERS, INTEGERS),
 }
 NUMBERS = {"an int": 2, "an int64": np.int64(2), "an array": np.array(2)}
 
@@ -37,21 +40,14 @@ def take_step(task, actions, action):
     return env.step(action)
 
 
-@pytest.mark.parametrize("name", WAYS_TO_SAY)
+@pytest.mark.parametrize("name", [*SAID, *NUMBERS])
 def test_an_action_of_any_type_is_driven_as_by_the_task(name):
-    steps = [
-        take_step(task, "continuous", WAYS_TO_SAY[name])
-        for task in (Navigation, Driving)
-    ]
-    np.testing.assert_equal(steps[0], steps[1])
-
-
-@pytest.mark.parametrize("name", NUMBERS)
-def test_a_discrete_action_of_any_type_is_driven_as_by_the_task(name):
-    steps = [
-        take_step(task, "discrete", NUMBERS[name]) for task in (Navigation, Driving)
-    ]
-    np.testing.assert_equal(steps[0], steps[1])
+    numbers, action = SAID.get(name, (2, NUMBERS.get(name)))
+    actions = "continuous" if name in SAID else "discrete"
+    plain = np.array(numbers, np.float64) if name in SAID else numbers
+    expected = take_step(Driving, actions, plain)
+    for task in (Navigation, Driving):
+        np.testing.assert_equal(take_step(task, actions, action), expected)
 
 
 @pytest.mark.parametrize(

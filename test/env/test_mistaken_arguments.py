@@ -162,30 +162,6 @@ def test_a_closed_env_refuses_what_is_called_after_close(
     env.close()  # a second time does nothing
 
 
-@pytest.mark.parametrize(
-    ("text", "suffix", "sentence"),
-    [
-        ("x = 1", "", "defines no subclass of nics_drl_bridge.env.task.Task"),
-        ("x = 1", ":Patrol", "defines no subclass of nics_drl_bridge.env.task.Task"),
-        (
-            "from nics_drl_bridge.env.tasks.navigation import Navigation\n"
-            "class Mine(Navigation): pass",
-            "",
-            "name its class, for example .*:Mine",
-        ),
-        (None, "", "no such file; give path/to/file.py:ClassName"),
-    ],
-)
-def test_a_file_without_a_task_is_told(
-    tmp_path: Path, text: str | None, suffix: str, sentence: str
-) -> None:
-    file = tmp_path / "mine.py"
-    if text is not None:
-        file.write_text(text)
-    with pytest.raises(BridgeError, match=sentence):
-        nics_drl_bridge.make(f"{file}{suffix}")
-
-
 def test_a_space_that_is_a_method_is_refused() -> None:
     methods = {"observation_space": lambda self: None}
     with pytest.raises(BridgeError, match="observation_space must be a property"):

@@ -99,16 +99,6 @@ def test_an_option_of_another_shape_is_refused_rather_than_spread(goal):
         single().reset(options={"goal": goal})
 
 
-@pytest.mark.parametrize("kind", [np.float16, np.int8, np.uint64, np.bool_, list])
-def test_an_action_of_any_real_numbers_is_an_action(kind):
-    env = single()
-    ones = [1, 0, 1]
-    env.reset(seed=0)
-    told = env.step(ones if kind is list else np.array(ones, kind))
-    env.reset(seed=0)
-    assert np.array_equal(told[0], env.step(np.array(ones, np.float32))[0])
-
-
 @pytest.mark.parametrize(
     "command", [lambda c: c[..., :1], lambda c: c * np.nan, lambda c: c[0]]
 )

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import re
 import warnings
-from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -71,6 +70,7 @@ def test_a_task_from_a_file_passes_the_checker_and_steps_alike_alone_and_in_a_ve
         ("cooperative_reaching", {"robots": 2.5}, "robots=2.5: must be a whole number"),
         ("cooperative_reaching", {"robots": 1}, "a team needs at least 2"),
         ("pursuit_evasion", {"evaders": 0}, "at least 1 each"),
+        ("navigation", {"scan": {"sectors": 36, "range_max": 9.0}}, "range_max"),
         (
             Navigation(DIRECT, lidar(beams=36)),
             None,
@@ -87,24 +87,35 @@ def test_a_wrong_task_gives_one_sentence(task, options, sentence):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "name", "told"),
     [
-        ("x = 1\nclass Own(:\n", "line 2: can't be imported (SyntaxError"),
+        ("x = 1\nclass Own(:\n", ":Own", "line 2: can't be imported (SyntaxError"),
         (
             "import nowhere_to_be_found\n",
+            ":Own",
             "line 1: can't be imported (ModuleNotFoundError",
         ),
-        ("x = 1\n\ny = 1 / 0\n", "line 3: can't be imported (ZeroDivisionError"),
-        ("\0", "can't be imported ("),
+        (
+            "x = 1\n\ny = 1 / 0\n",
+            ":Own",
+            "line 3: can't be imported (ZeroDivisionError",
+        ),
+        ("\0", ":Own", "can't be imported ("),
+        ("x = 1", "", "defines no subclass of nics_drl_bridge.env.task.Task"),
+        ("x = 1", ":Own", "defines no subclass of nics_drl_bridge.env.task.Task"),
+        (OWN.read_text(), "", "name its class, for example"),
+        (None, "", "no such file; give path/to/file.py:ClassName"),
     ],
 )
-def test_a_file_of_a_task_that_is_no_python_that_runs_is_told_of_with_its_line(
-    tmp_path, text, told
+def test_a_file_without_a_task_that_can_be_made_is_told_of_in_one_sentence(
+    tmp_path, text, name, told
 ):
-    (tmp_path / "own.py").write_text(text)
+    file = tmp_path / "own.py"
+    if text is not None:
+        file.write_text(text)
     with pytest.raises(ConfigError) as caught:
-        make_task(f"{tmp_path}/own.py:Own", direct_model())
-    assert f"task {tmp_path}/own.py" in str(caught.value)
+        make_task(f"{file}{name}", direct_model())
+    assert str(file) in str(caught.value)
     assert told in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -201,25 +212,6 @@ def test_a_task_sees_sectors_where_a_layout_is_given_and_judges_touches_by_beams
     assert sectors.touches(ranges).tolist() == own.touches(ranges).tolist()
 
 
-def test_a_scan_layout_that_the_lidar_cannot_fill_is_refused_when_the_task_is_made():
-    with pytest.raises(ConfigError, match="range_max"):
-        make_task(
-            "navigation", direct_model(), {"scan": {"sectors": 36, "range_max": 9.0}}
-        )
-
-
-def test_a_policy_of_sectors_sees_the_same_from_lidars_of_other_layout():
-    views = []
-    for beams, angle_min in ((720, -np.pi), (1440, 0.0)):
-        spec = lidar(
-            beams=beams, angle_min=angle_min, angle_max=angle_min + 2.0 * np.pi
-        )
-        task = make_task("navigation", direct_model(sensor=spec), {"scan": "around"})
-        ranges = (1.5 + np.cos(spec.angles)).astype(np.float32)
-        views.append(task.free_share(ranges))
-    assert views[0] == pytest.approx(views[1], abs=0.01)
-
-
 TRUCK = ((0.5, 0.2), (0.5, -0.2), (-0.3, -0.2), (-0.3, 0.2))
 ARROW = ((0.6, 0.0), (-0.3, -0.3), (0.0, 0.0), (-0.3, 0.3))
 MARGIN = 0.02
@@ -258,12 +250,6 @@ def test_beams_that_do_not_cross_a_footprint_touch_nothing():
     assert (found[~ahead] > 0.0).any()
 
 
-def test_a_round_footprint_is_left_at_its_radius_from_the_middle():
-    spec = load_robot("differential")
-    found = find_contact_ranges(spec, mounted((0.0, 0.0, 0.5)), MARGIN)
-    assert found == pytest.approx(spec.footprint_radius + MARGIN, abs=1e-6)
-
-
 def test_a_top_speed_limits_commands_in_m_per_s_and_no_others():
     jackal = open_model("jackal")
     slow = Navigation(jackal.robot, jackal.lidar, top_speed=0.4)
@@ -293,64 +279,19 @@ class Counting(Navigation):
         memory["count"] = memory["count"] + 1.0
 
 
-class Changes:
-    """Rewards where the scan changes."""
-
-    def reward(self, before, after, memory):
-        return {"changed": 1.0 * (before.ranges != after.ranges).sum(axis=-1)}
-
-
-class Mixed(Changes, Navigation):
-    """Has the reward from a class that is no task."""
-
-
-class Own(Navigation):
-    """Has the reward by itself."""
-
-    reward = Changes.reward
-
-
-class Pass:
-    """Does all of a step, though it is no task."""
-
-    def step_into(self, out, before, after, memory):
-        outcome = super().step_into(out, before, after, memory)
-        return replace(outcome, info=outcome.info | {"passed": np.ones(out.shape[:-1])})
-
-
-class Passed(Pass, Navigation):
-    """Has that before the one of navigation."""
-
-
-def test_a_step_of_ones_own_in_one_pass_is_kept():
-    env = gymnasium.make(TASK, model=direct_model(), world=field(), task=Passed)
-    env.reset(seed=0)
-    assert env.step(np.zeros(3, np.float32))[4]["passed"] == 1.0
-
-
-@pytest.mark.parametrize("task", [Mixed, Own])
-def test_a_part_of_navigation_that_is_overridden_alone_counts(task):
-    arguments = {"model": direct_model(), "world": field(), "task": task}
-    alone = gymnasium.make(TASK, **arguments)
-    several = gymnasium.make_vec(TASK, 2, **arguments)
-    alone.reset(seed=0)
-    several.reset(seed=0)
-    ahead = np.ones((2, 3), np.float32)
-    terms = alone.step(ahead[0])[4]["reward_terms"]
-    assert terms["changed"] > 0.0
-    both = several.step(ahead)[4]["reward_terms"]
-    assert terms == {name: both[name][0] for name in terms}
-
-
+@pytest.mark.parametrize("mixed_in", [False, True])
 @pytest.mark.parametrize("part", [*PARTS, "step_into", "take_step", "command", "drive"])
-def test_each_step_calls_a_method_that_a_subclass_of_navigation_overrides(part):
+def test_each_step_calls_a_method_that_overrides_that_of_navigation(part, mixed_in):
     called = []
 
     def call(self, *given):
         called.append(part)
         return getattr(Navigation, part)(self, *given)
 
-    task = type("Calling", (Navigation,), {part: call})
+    bases = (Navigation,)
+    if mixed_in:  # by a class that is no task
+        bases = (type("Mixin", (), {part: call}), Navigation)
+    task = type("Calling", bases, {} if mixed_in else {part: call})
     env = gymnasium.make(TASK, model=direct_model(), world=field(), task=task)
     env.reset(seed=0)
     called.clear()

@@ -13,7 +13,7 @@ from robots import direct_model, field
 
 from nics_drl_bridge.env import vector_env
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.registry import ENVIRONMENTS, NAVIGATION
+from nics_drl_bridge.env.registry import NAVIGATION, PURSUIT_EVASION
 from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -48,7 +48,6 @@ IDS = (
     "cooperative-sectors",
 )
 LIMIT = 25
-THREADS = (1, 2)
 
 
 def model():
@@ -97,7 +96,7 @@ def assert_alike(ours, theirs, path="info"):
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("task", TASKS, ids=IDS)
 def test_it_steps_as_gymnasiums_own_vector_env_of_single_envs(task, mode):
-    ours = vector(3, autoreset_mode=mode, **task)
+    ours = vector(3, threads=2, autoreset_mode=mode, **task)
     theirs = SyncVectorEnv([lambda: single(**task)] * 3, autoreset_mode=mode)
     assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"]
     assert ours.observation_space == theirs.observation_space
@@ -117,21 +116,17 @@ def test_it_steps_as_gymnasiums_own_vector_env_of_single_envs(task, mode):
     assert ended >= 9
 
 
-@pytest.mark.parametrize(
-    ("steps", "counts"),
-    [(100, (1, 17)), pytest.param(800, (1, 4, 64), marks=pytest.mark.campaign)],
-)
 @pytest.mark.parametrize("task", TASKS, ids=IDS)
-def test_a_world_does_not_depend_on_how_many_others_there_are(task, steps, counts):
+def test_a_world_does_not_depend_on_how_many_others_there_are(task):
     def course(count):
         env = vector(count, **task)
         seen = [env.reset(seed=10)[0][:1]]
-        for action in actions_of(vector(1, **task), steps):
+        for action in actions_of(vector(1, **task), 100):
             step = env.step(np.repeat(action, count, axis=0))
             seen += [part[:1].copy() for part in step[:4]]
         return digest(seen)
 
-    assert len({course(count) for count in counts}) == 1
+    assert course(1) == course(17)
 
 
 def digest(arrays):
@@ -141,25 +136,17 @@ def digest(arrays):
     return found.hexdigest()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("task", TASKS[1:4], ids=IDS[1:4])
-def test_threads_change_no_bit(task, mode):
-    envs = [
-        vector(5, threads=threads, autoreset_mode=mode, **task) for threads in THREADS
-    ]
-    if mode == "SameStep" and envs[0].robots == 1:
-        for env in envs:
-            env.teach(Teaching(path=1.0, contact=-1.0, retries=1))
-    firsts = [env.reset(seed=6) for env in envs]
-    for other in firsts[1:]:
-        assert np.array_equal(firsts[0][0], other[0])
+def test_threads_change_no_bit_of_what_is_taught():
+    envs = [vector(5, threads=n, autoreset_mode="SameStep") for n in (1, 2)]
+    for env in envs:
+        env.teach(Teaching(path=1.0, contact=-1.0, retries=1))
+    one, other = (env.reset(seed=6) for env in envs)
+    assert np.array_equal(one[0], other[0])
     for action in actions_of(envs[0], 60):
-        one, *others = [env.step(action) for env in envs]
-        for other in others:
-            for a, b in zip(one[:4], other[:4], strict=True):
-                assert np.array_equal(a, b)
-            assert_alike(one[4], other[4])
+        one, other = (env.step(action) for env in envs)
+        for a, b in zip(one[:4], other[:4], strict=True):
+            assert np.array_equal(a, b)
+        assert_alike(one[4], other[4])
 
 
 def test_returned_arrays_are_the_callers_own_unless_it_wants_none():
@@ -188,18 +175,12 @@ def test_a_mask_resets_some_worlds_only():
     assert np.array_equal(info["_episode_seed"], mask)
 
 
-def test_start_and_goal_can_be_given_to_all_worlds():
-    env = vector(2)
-    _, info = env.reset(
-        seed=0, options={"start": (1.0, -1.0, 0.5), "goal": (-1.0, 1.0)}
-    )
-    assert info["pose"] == pytest.approx(np.array([[1.0, -1.0, 0.5]] * 2))
-    assert info["goal"] == pytest.approx(np.array([[-1.0, 1.0]] * 2))
-
-
-@pytest.mark.parametrize("name", ENVIRONMENTS)
 @pytest.mark.parametrize(
-    ("actions", "mode"), [("continuous", MODES[0]), ("discrete", MODES[1])]
+    ("name", "actions", "mode"),
+    [
+        (NAVIGATION, "continuous", MODES[0]),
+        (PURSUIT_EVASION, "discrete", MODES[1]),
+    ],
 )
 def test_gymnasiums_checks_of_an_env_find_nothing_to_warn_of_in_a_vector(
     name, actions, mode
@@ -225,19 +206,6 @@ def test_gymnasiums_checks_of_an_env_find_nothing_to_warn_of_in_a_vector(
             checking.check_space_limit(space, "action")
         env.close()
         env.close()
-
-
-def test_gymnasiums_wrappers_take_it():
-    env = gymnasium.make_vec(NAVIGATION, 2, model=model(), world=field(count=2))
-    env = gymnasium.wrappers.vector.RecordEpisodeStatistics(env)
-    env.reset(seed=0)
-    lengths = []
-    for action in actions_of(env, 400):
-        info = env.step(action)[4]
-        if "episode" in info:
-            lengths += info["episode"]["l"][info["_episode"]].tolist()
-    assert lengths
-    assert min(lengths) >= 1
 
 
 class Fragile(Navigation):
@@ -280,7 +248,7 @@ def test_many_zeros_are_zeros_where_memory_can_not_be_mapped_privately_as_on_win
 
 
 @pytest.mark.parametrize("kept", [(0,), (0, 1, 3)])
-@pytest.mark.parametrize("kind", ["f8", "f4", "i8", "?", "U3", "S3", "O"])
+@pytest.mark.parametrize("kind", ["f8", "?", "U3", "O"])
 def test_facts_of_some_worlds_are_copies_and_zeros_elsewhere_however_many_they_are(
     kind, kept
 ):

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from robots import lidar
@@ -58,40 +60,27 @@ def test_rows_lie_apart_within_the_table_and_leave_room_at_its_end():
     assert len(table.rows) == ends[-1] + count_padding(SPEC.angle_increment)
 
 
-def test_shapes_are_added_at_the_density_of_the_table():
-    table = bake(SPEC, [SQUARE], SMALL)
+@pytest.mark.parametrize(
+    "make", [partial(bake, density=SMALL), LidarTable.without_rows]
+)
+def test_shapes_are_added_as_the_others_were(make):
+    table = make(SPEC, [SQUARE, SQUARE])
     assert add_shapes(SPEC, table, [SQUARE]) is table
     more = add_shapes(SPEC, table, [STRIP])
     assert more.shapes == (SQUARE, STRIP)
-    assert more.density == SMALL
+    assert (more.density, more.has_rows) == (table.density, table.has_rows)
 
 
-@pytest.mark.parametrize(
-    "density", [Density(distances=10_000, rotations=100_000, phases=8)]
-)
-def test_a_table_that_no_index_can_reach_is_refused(density, monkeypatch):
+def test_a_table_that_no_index_can_reach_is_refused(monkeypatch):
     monkeypatch.setattr("nics_drl_bridge.lidar.bake.MOST_NUMBERS", 1000)
     with pytest.raises(ConfigError, match="is too large; lower `distances`"):
-        bake(
-            SPEC,
-            [SQUARE],
-            density.model_copy(update={"distances": 50, "rotations": 40}),
-        )
+        bake(SPEC, [SQUARE], Density(distances=50, rotations=40))
 
 
 def test_the_points_of_a_row_are_near_each_other_whatever_the_beams():
-    def phases(beams):
-        return Density.for_beams(2.0 * np.pi / beams).phases
-
-    assert [phases(beams) for beams in (2048, 720, 360, 180, 90, 36, 1)] == [
-        1,
-        1,
-        2,
-        4,
-        8,
-        8,
-        8,
-    ]
+    beams = [2048, 720, 360, 180, 90, 36, 1]
+    phases = [Density.for_beams(2.0 * np.pi / count).phases for count in beams]
+    assert phases == [1, 1, 2, 4, 8, 8, 8]
     assert bake(lidar(beams=180), [SQUARE]).density.phases == 4
 
 
@@ -101,11 +90,3 @@ def test_a_shape_that_covers_more_beams_than_a_row_has_is_refused_with_the_way_o
         ConfigError, match=r"radius 0.2 m covers too many beams .* 1.2e-05 rad"
     ):
         bake(narrow, [Circle(radius=0.2)])
-
-
-def test_shapes_are_added_to_a_table_without_rows_at_no_cost():
-    table = LidarTable.without_rows(SPEC, [SQUARE, SQUARE])
-    assert table.shapes == (SQUARE,)
-    more = add_shapes(SPEC, table, [STRIP])
-    assert more.shapes == (SQUARE, STRIP)
-    assert not more.has_rows

@@ -12,7 +12,7 @@ from nics_drl_bridge.lidar.sectors import (
     ScanLayout,
     layout_of,
     make_reader,
-    plan_of,
+    make_sector_plan,
 )
 from nics_drl_bridge.lidar.spec import ScanHeader, load_lidar
 
@@ -69,14 +69,16 @@ def test_a_sector_holds_the_nearest_return_of_its_beams(heading, angles):
     rng = np.random.default_rng(1)
     ranges = rng.uniform(0.1, 3.0, 720).astype(np.float32)
     ranges[rng.random(720) < 0.4] = rng.choice([np.nan, np.inf, -np.inf], 1)
-    ours = resampled(plan_of(spec, AROUND), ranges)
+    ours = resampled(make_sector_plan(spec, AROUND), ranges)
     assert np.array_equal(ours, nearest_of(spec, ranges, AROUND), equal_nan=True)
 
 
 def test_a_coarse_lidar_gives_a_sector_the_nearer_of_the_beams_beside_it():
     spec = lidar(beams=36)
     ranges = np.arange(36, dtype=np.float32) / 36.0
-    seen = resampled(plan_of(spec, ScanLayout(sectors=360, range_max=3.0)), ranges)
+    seen = resampled(
+        make_sector_plan(spec, ScanLayout(sectors=360, range_max=3.0)), ranges
+    )
     assert np.isfinite(seen).all()
     assert seen[15] == ranges[1]  # between beams 1 and 2
     assert seen[-5] == ranges[0]  # between the last and the first
@@ -84,7 +86,7 @@ def test_a_coarse_lidar_gives_a_sector_the_nearer_of_the_beams_beside_it():
 
 def test_what_was_not_measured_stays_unknown_and_what_is_too_close_wins():
     ranges = np.full(720, 2.0, np.float32)
-    plan = plan_of(lidar(beams=720), AROUND)
+    plan = make_sector_plan(lidar(beams=720), AROUND)
     ranges[0:11], ranges[100], ranges[200], ranges[305] = (
         np.nan,
         -np.inf,
@@ -103,7 +105,8 @@ def test_what_was_not_measured_stays_unknown_and_what_is_too_close_wins():
 def test_a_lidar_mounted_elsewhere_sees_what_one_at_the_viewpoint_does(mount):
     spec = lidar(beams=1440, range_max=6.0, mount=mount)
     seen = resampled(
-        plan_of(spec, AROUND), room(np.array(mount[:2]), spec.angles + mount[2])
+        make_sector_plan(spec, AROUND),
+        room(np.array(mount[:2]), spec.angles + mount[2]),
     )
     fine = np.linspace(-AROUND.width / 2, AROUND.width / 2, 201)
     exact = room(np.zeros(2), AROUND.angles[:, None] + fine).min(axis=1)
@@ -111,7 +114,7 @@ def test_a_lidar_mounted_elsewhere_sees_what_one_at_the_viewpoint_does(mount):
 
 
 def test_a_moved_lidar_sees_free_space_as_free_and_tells_what_is_too_close():
-    plan = plan_of(lidar(beams=720, mount=(0.2, 0.0, 0.0)), AROUND)
+    plan = make_sector_plan(lidar(beams=720, mount=(0.2, 0.0, 0.0)), AROUND)
     ranges = np.full(720, np.inf, np.float32)
     assert resampled(plan, ranges).tolist() == [np.inf] * 72
     ranges[360] = -np.inf
@@ -128,7 +131,7 @@ def test_a_moved_lidar_sees_free_space_as_free_and_tells_what_is_too_close():
 )
 def test_a_lidar_that_cannot_fill_the_layout_is_refused_in_one_sentence(changes, words):
     with pytest.raises(ConfigError, match=words) as refused:
-        plan_of(lidar(**changes), AROUND)
+        make_sector_plan(lidar(**changes), AROUND)
     assert str(refused.value).count(". ") == 0
 
 
@@ -139,7 +142,7 @@ def test_a_layout_is_given_by_name_number_or_fields():
     assert layout_of({"sectors": 36, "range_max": 2.0}, spec).sectors == 36
     own = layout_of(30, spec)
     assert (own.sectors, own.range_max, own.viewpoint) == (30, 3.0, (0.1, 0.0))
-    plan = plan_of(spec, own)
+    plan = make_sector_plan(spec, own)
     assert plan.hits.min() >= 1
     assert plan.shift.tolist() == [0.0, 0.0]
 
@@ -159,7 +162,7 @@ def test_a_wrong_layout_is_refused_with_the_fix(given, words):
 
 
 def reader_sees(reader: Reader, ranges, layout=AROUND):
-    return resampled(plan_of(reader.lidar, layout), reader.ordered(ranges))
+    return resampled(make_sector_plan(reader.lidar, layout), reader.ordered(ranges))
 
 
 def test_a_header_gives_back_its_lidar():
@@ -181,7 +184,8 @@ def test_beams_that_come_clockwise_are_put_in_order():
     )
     found = make_reader(clockwise, 720, spec)
     assert np.array_equal(
-        reader_sees(found, ranges[::-1]), resampled(plan_of(spec, AROUND), ranges)
+        reader_sees(found, ranges[::-1]),
+        resampled(make_sector_plan(spec, AROUND), ranges),
     )
 
 
@@ -191,7 +195,7 @@ def test_a_lidar_that_hangs_upside_down_turns_the_other_way():
     found = make_reader(spec.header, 720, spec, upside_down=True)
     upright = room(np.array([0.3, 0.4]), spec.angles)
     assert reader_sees(found, below) == pytest.approx(
-        resampled(plan_of(spec, AROUND), upright)
+        resampled(make_sector_plan(spec, AROUND), upright)
     )
 
 
@@ -207,7 +211,7 @@ def test_odd_headers_of_a_full_circle_are_understood(beams, changes):
     found = make_reader(header(lidar(beams=720), **changes), beams, lidar())
     assert found.lidar.beams == beams
     assert found.lidar.angle_increment == pytest.approx(2.0 * np.pi / 720, rel=2e-3)
-    plan_of(found.lidar, AROUND)
+    make_sector_plan(found.lidar, AROUND)
 
 
 @pytest.mark.parametrize(

@@ -31,18 +31,8 @@ SENSORS = {
     "half, off-centre": lidar(
         beams=45, angle_min=-HALF, angle_max=HALF, mount=(-0.3, 0.1, 3.0)
     ),
-    "one beam ahead": lidar(beams=1, angle_min=-0.1, angle_max=0.1),
-    "from zero": lidar(beams=90, angle_min=0.0, angle_max=2.0 * np.pi),
-    "clockwise of zero": lidar(beams=61, angle_min=-6.0, angle_max=-1.0),
     "short": lidar(beams=90, range_min=0.4, range_max=1.2),
-    "one beam": lidar(beams=1),
-    "seven beams": lidar(beams=7),
-    "2048 beams": lidar(beams=2048),
 }
-CAMPAIGN = [
-    name if n < 3 else pytest.param(name, marks=pytest.mark.campaign)
-    for n, name in enumerate(SENSORS)
-]
 
 
 def scan(scanner, scene):
@@ -68,7 +58,7 @@ def rmse(spec, one, other):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CAMPAIGN)
+@pytest.mark.parametrize("name", SENSORS)
 def test_exact_scans_of_random_scenes_agree_with_plane_geometry(name):
     spec = SENSORS[name]
     compared = 0
@@ -99,11 +89,9 @@ def test_a_lidar_inside_or_beside_any_shape_sees_what_plane_geometry_says():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CAMPAIGN)
+@pytest.mark.parametrize("name", SENSORS)
 def test_baked_scans_of_random_scenes_are_near_the_exact_ones(name):
     spec = SENSORS[name]
-    if spec.beams > 1000:
-        spec = lidar(beams=720)  # beams as narrow as these show the same
     table = bake(spec, random_shapes(0)[::2], Density())
     scenes = [random_scene(seed, table.shapes) for seed in range(30)]
     baked, exact = (
@@ -120,40 +108,21 @@ def test_baked_scans_of_random_scenes_are_near_the_exact_ones(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "density",
-    [
-        Density(distances=20, rotations=24),
-        pytest.param(Density(), marks=pytest.mark.campaign),
-    ],
-)
-@pytest.mark.parametrize("corners", [8, pytest.param(200, marks=pytest.mark.campaign)])
 @pytest.mark.parametrize("make", POLYGONS)
-def test_silhouettes_of_any_polygon_are_exact_at_any_density(make, corners, density):
+def test_silhouettes_of_any_polygon_are_exact_at_any_density(make):
     spec = lidar(beams=360, range_min=0.0)
-    shape = make(np.random.default_rng(corners), corners)
+    shape = make(np.random.default_rng(8), 8)
     rng = np.random.default_rng(1)
     # From touching on; not so far that the limit of range decides instead of the silhouette.
     away = shape.radius * (1.0 + 1e-9) + rng.uniform(0.0, 1.0, (300, 1)) ** 3 * 1.5
-    table = bake(spec, [shape], density)
+    table = bake(spec, [shape], Density(distances=20, rotations=24))
     seen, truly = np.isfinite(both_ways(spec, table, [shape], poses_around(rng, away)))
     assert (seen != truly).mean() < 2e-5
     assert truly.any()
 
 
-@pytest.mark.parametrize("shape", [Circle(radius=0.15), SQUARE, STRIP])
-def test_the_papers_scenes_are_off_by_less_than_3_mm(shape):
-    spec = lidar(beams=720)
-    table = bake(spec, [shape])
-    poses = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 10, 3)) * [3.0, 3.0, np.pi]
-    baked, exact = both_ways(spec, table, [shape] * 10, poses)
-    assert (finite(exact, spec) < spec.range_max).mean() > 0.2
-    assert rmse(spec, baked, exact) < 0.003
-
-
-@pytest.mark.parametrize("beams", [1, 36, 360])
-def test_few_beams_are_baked_as_finely_as_many(beams):
-    spec = lidar(beams=beams)
+def test_few_beams_are_baked_as_finely_as_many():
+    spec = lidar(beams=36)
     rng = np.random.default_rng(0)
     area = rng.uniform(STRIP.radius**2, (spec.range_max + STRIP.radius) ** 2, (200, 10))
     poses = poses_around(rng, np.sqrt(area))
@@ -223,8 +192,7 @@ def test_a_scan_in_a_batch_is_the_scan_alone_to_the_bit():
     assert np.array_equal(scanner.scan(robots, bodies, walls, out=apart), batch)
 
 
-@pytest.mark.parametrize("view", [4.0, 2.0 * np.pi])
-@pytest.mark.parametrize("beams", [1, 49, 1081])
+@pytest.mark.parametrize(("beams", "view"), [(1, 4.0), (49, 2.0 * np.pi), (1081, 4.0)])
 def test_any_number_of_walls_is_met_by_any_number_of_beams(beams, view):
     low = -0.5 * view
     spec = lidar(beams=beams, angle_min=low, angle_max=-low, range_max=6.0)
@@ -267,9 +235,7 @@ def test_nobody_nothing_and_a_body_without_radius_can_be_scanned():
 
 
 @pytest.mark.parametrize("renderer", ["baked", "exact"])
-@pytest.mark.parametrize(
-    ("wrong", "column"), [(np.nan, 0), (np.inf, 0), (np.nan, 2), (np.inf, 2)]
-)
+@pytest.mark.parametrize(("wrong", "column"), [(np.nan, 0), (np.inf, 2)])
 @pytest.mark.filterwarnings("error")
 def test_a_pose_that_is_no_number_neither_hangs_nor_harms_the_others(
     renderer, wrong, column
@@ -283,13 +249,6 @@ def test_a_pose_that_is_no_number_neither_hangs_nor_harms_the_others(
     robots = np.stack([poses[1], HERE[0]])
     pair = np.stack([bodies[:1], bodies[:1]])
     assert np.array_equal(scanner.scan(robots, pair)[1:], expected)
-
-
-def scans_by_renderer(spec, shape, poses):
-    table = bake(spec, [shape])
-    bodies = Scanner(spec, table).place([shape], poses)
-    robots = np.zeros((len(poses), 3))
-    return {way: Scanner(spec, table, way).scan(robots, bodies) for way in RENDERERS}
 
 
 NOTCHED = Polygon(points=((0.0, 0.0), (0.5, 0.0), (0.1, 0.1), (0.0, 0.5)))
@@ -309,7 +268,11 @@ NOTCHED = Polygon(points=((0.0, 0.0), (0.5, 0.0), (0.1, 0.1), (0.0, 0.5)))
 def test_auto_looks_up_all_but_wide_beams_huge_shapes_and_notches(beams, shape, same):
     rng = np.random.default_rng(0)
     poses = poses_around(rng, shape.radius + rng.uniform(0.5, 1.5, (100, 1)))
-    scans = scans_by_renderer(lidar(beams=beams), shape, poses)
+    spec = lidar(beams=beams)
+    table = bake(spec, [shape])
+    bodies = Scanner(spec, table).place([shape], poses)
+    robots = np.zeros((len(poses), 3))
+    scans = {way: Scanner(spec, table, way).scan(robots, bodies) for way in RENDERERS}
     assert np.array_equal(scans["auto"], scans[same])
     assert np.isfinite(scans["exact"]).any()
     assert not np.array_equal(scans["baked"], scans["exact"])

@@ -32,8 +32,6 @@ from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 ROBOTS = ("ackermann", "differential", "mecanum")
-PLANNERS = ("dynamic_window", "mppi")
-campaign = pytest.mark.campaign
 
 
 def task_of(robot, **changes):
@@ -59,7 +57,7 @@ def test_any_observation_gives_an_action_of_the_space_alone_as_among_many(robot,
     among = make_policy(name, task)
     rng = np.random.default_rng(0)
     seen = []
-    for _ in range(20):
+    for _ in range(8):
         ranges = rng.choice([np.inf, -np.inf, np.nan, 0.3, 1.0], 90).astype(np.float32)
         seen.append(observe(task, rng.uniform(-3, 3), rng.uniform(0, 5), ranges))
     actions = among.act(np.array(seen))
@@ -86,19 +84,11 @@ def test_it_turns_or_moves_to_the_side_of_the_goal_and_drives_to_one_ahead(robot
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "robot",
-    [
-        pytest.param("ackermann", marks=campaign),
-        "differential",
-        pytest.param("mecanum", marks=campaign),
-    ],
-)
-def test_the_planner_reaches_most_goals_where_straight_ones_collide(robot):
-    env = BridgeVectorEnv(30, robot, "arena", max_episode_steps=200)
+def test_the_planner_reaches_most_goals_where_straight_ones_collide():
+    env = BridgeVectorEnv(20, "differential", "arena", max_episode_steps=200)
     share = {
         name: drive_worlds(
-            env, make_policy(name, env.task).act, range(30)
+            env, make_policy(name, env.task).act, range(20)
         ).success.mean()
         for name in ("dynamic_window", "straight", "random")
     }
@@ -115,7 +105,7 @@ def test_the_planner_leaves_its_start_with_wheels_that_answer_slowly(tmp_path):
         model=str(slow), world="empty", estimator=True
     )  # at rest it shows no noise
     policy = make_policy("dynamic_window", env.task)
-    assert successes(drive_all(TimeLimit(env, 300), policy, range(3))) == 3
+    assert successes(drive_all(TimeLimit(env, 300), policy, [0])) == 1
 
 
 def car(**changes):
@@ -218,7 +208,7 @@ def test_a_shipped_policy_drives_where_it_was_learnt_to(name):
     assert found.collision.mean() <= 0.04
 
 
-def weak_jackal(rate=0.2):
+def weak_jackal(rate):
     """A Jackal whose wheels brake weakly [m/s^2 at the rim], but speed up as ever."""
     model = builtin_model("jackal")
     brakes = rate / model.robot.parameters["wheel_radius"]
@@ -227,13 +217,10 @@ def weak_jackal(rate=0.2):
 
 
 @pytest.mark.parametrize("name", ["dynamic_window", "mppi"])
-@pytest.mark.parametrize("rate", [0.2, 20.0])
 @pytest.mark.slow
-def test_a_planner_stops_a_robot_before_a_wall_also_if_its_wheels_brake_weakly(
-    name, rate
-):
+def test_a_planner_stops_a_robot_before_a_wall_although_its_wheels_brake_weakly(name):
     """The goal is behind the wall, so that it drives up to it, at a speed that it can brake."""
-    model = weak_jackal(rate)
+    model = weak_jackal(0.2)
     task = Navigation(model.robot, model.lidar)
     backend = SimBackend(model, field(9.0))
     policy = make_policy(name, task, model)
@@ -249,8 +236,7 @@ def test_a_planner_stops_a_robot_before_a_wall_also_if_its_wheels_brake_weakly(
     assert farthest > 0.5
 
 
-@pytest.mark.parametrize("name", ["dynamic_window", "mppi"])
-def test_a_planner_refuses_a_model_that_does_not_stop(name):
+def test_a_planner_refuses_a_model_that_does_not_stop():
     model = weak_jackal(1e-5)
     with pytest.raises(ConfigError, match=r"'jackal': its model does not stop"):
-        make_policy(name, Navigation(model.robot, model.lidar), model)
+        make_policy("dynamic_window", Navigation(model.robot, model.lidar), model)

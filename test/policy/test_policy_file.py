@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import pickle
 import subprocess
 import sys
@@ -71,107 +70,86 @@ def test_an_observation_of_another_size_is_refused(file):
 
 # What is refused. Each takes the parsed file and gives the bytes of a spoilt one.
 
+ABSENT = object()
 
-def changed(path, value, resigned):
-    """An entry of the contract set to another value; the hash of the graph follows or not."""
+
+def contract(place, value=ABSENT):
+    """An entry of the contract set to another value, or left out, with the hash of the graph."""
 
     def spoil(proto):
-        data = contract_in(proto)
-        at = data
-        for key in path[:-1]:
-            at = at[key]
-        at[path[-1]] = value
-        return bytes_of(
-            signed(proto, data) if resigned else with_contract(proto, json.dumps(data))
-        )
-
-    return spoil
-
-
-def weights(value, resigned=True):
-    def spoil(proto):
-        tensor, array = weight(proto)
-        array.flat[0] = value
-        tensor.CopyFrom(onnx.numpy_helper.from_array(array, tensor.name))
-        return bytes_of(signed(proto) if resigned else proto)
-
-    return spoil
-
-
-def elsewhere(location):
-    def spoil(proto):
-        tensor, _ = weight(proto)
-        tensor.ClearField("raw_data")
-        tensor.data_location = onnx.TensorProto.EXTERNAL
-        entry = tensor.external_data.add()
-        entry.key = "location"
-        entry.value = location
-        return bytes_of(signed(proto))
-
-    return spoil
-
-
-def node(op_type, domain="", **attributes):
-    def spoil(proto):
-        ends = ["observation"], ["unused"]
-        proto.graph.node.append(
-            onnx.helper.make_node(op_type, *ends, domain=domain, **attributes)
-        )
-        if domain:
-            proto.opset_import.append(onnx.helper.make_opsetid(domain, 1))
-        return bytes_of(signed(proto))
-
-    return spoil
-
-
-def golden(name, position):
-    def spoil(proto):
-        data = contract_in(proto)
-        rows = GoldenEntry(**data["golden"]).rows(name).copy()
-        rows[position] += 2e-5
-        data["golden"][name] = base64.b64encode(rows.tobytes()).decode()
+        data = at = contract_in(proto)
+        *above, last = place.split(".")
+        for key in above:
+            at = at[int(key) if isinstance(at, list) else key]
+        if value is ABSENT:
+            del at[last]
+        else:
+            at[last] = value
         return bytes_of(signed(proto, data))
 
     return spoil
 
 
-def end(kind, name):
+def graph(change):
+    """A graph that is changed, with its hash in the contract."""
+
     def spoil(proto):
-        getattr(proto.graph, kind)[0].name = name
+        change(proto)
         return bytes_of(signed(proto))
 
     return spoil
 
 
-def doubles(proto):
+def set_weight(proto, value):
+    tensor, array = weight(proto)
+    array.flat[0] = value
+    tensor.CopyFrom(onnx.numpy_helper.from_array(array, tensor.name))
+
+
+def move_weights(proto):
+    tensor, _ = weight(proto)
+    tensor.ClearField("raw_data")
+    tensor.data_location = onnx.TensorProto.EXTERNAL
+    entry = tensor.external_data.add()
+    entry.key = "location"
+    entry.value = "weights.bin"
+
+
+def add_node(proto, op_type, domain="", **attributes):
+    ends = ["observation"], ["unused"]
+    node = onnx.helper.make_node(op_type, *ends, domain=domain, **attributes)
+    proto.graph.node.append(node)
+    if domain:
+        proto.opset_import.append(onnx.helper.make_opsetid(domain, 1))
+
+
+def add_function(proto):
+    node = onnx.helper.make_node("Tanh", ["x"], ["y"])
+    versions = [onnx.helper.make_opsetid("", 17)]
+    made = onnx.helper.make_function("own", "F", ["x"], ["y"], [node], versions)
+    proto.functions.append(made)
+
+
+def take_doubles(proto):
     proto.graph.input[0].type.tensor_type.elem_type = onnx.TensorProto.DOUBLE
-    return bytes_of(signed(proto))
 
 
-def loud(proto):
-    """Commands beyond the limits of the robot, by a contract of a weaker robot."""
+def forget(proto):
+    """The state comes back as it was given."""
+    for node in proto.graph.node:
+        for names in (node.output, node.input):
+            for k, name in enumerate(names):
+                names[k] = "forgotten" if name == "state_out" else name
+    last = onnx.helper.make_node("Identity", ["state_in"], ["state_out"])
+    proto.graph.node.append(last)
+
+
+def spoil_golden(proto):
     data = contract_in(proto)
-    data["robot"]["command"][0]["max"] = 0.01
+    rows = GoldenEntry(**data["golden"]).rows("actions").copy()
+    rows[0, 0] += 2e-5
+    data["golden"]["actions"] = base64.b64encode(rows.tobytes()).decode()
     return bytes_of(signed(proto, data))
-
-
-def function(proto):
-    proto.functions.append(
-        onnx.helper.make_function(
-            "own",
-            "F",
-            ["x"],
-            ["y"],
-            [onnx.helper.make_node("Tanh", ["x"], ["y"])],
-            [onnx.helper.make_opsetid("", 17)],
-        )
-    )
-    return bytes_of(signed(proto))
-
-
-def branch(proto):
-    inner = onnx.helper.make_graph([], "inner", [], [])
-    return node("Identity", body=inner)(proto)
 
 
 @pytest.fixture(scope="module")
@@ -181,34 +159,13 @@ def remembering(tmp_path_factory):
     return path
 
 
-def forgetful(proto):
-    """The state comes back as it was given."""
-    for node in proto.graph.node:
-        for k, name in enumerate(node.output):
-            node.output[k] = "forgotten" if name == "state_out" else name
-        for k, name in enumerate(node.input):
-            node.input[k] = "forgotten" if name == "state_out" else name
-    last = onnx.helper.make_node("Identity", ["state_in"], ["state_out"])
-    proto.graph.node.append(last)
-    return bytes_of(signed(proto))
-
-
-def contract_without(*path):
-    """The contract without an entry, with the hash of the graph."""
-
-    def spoil(proto):
-        data = contract_in(proto)
-        at = data
-        for key in path[:-1]:
-            at = at[key]
-        del at[path[-1]]
-        return bytes_of(signed(proto, data))
-
-    return spoil
-
-
 def text(words):
     return lambda proto: bytes_of(with_contract(proto, words))
+
+
+def other_weights(proto):
+    set_weight(proto, 0.5)
+    return bytes_of(proto)
 
 
 def no_contract(proto):
@@ -216,48 +173,48 @@ def no_contract(proto):
     return bytes_of(proto)
 
 
-def stateful(proto):
-    data = contract_in(proto)
-    data["state"] = {"size": 4, "start": 0.0, "longest_gap": 1.0}
-    return bytes_of(signed(proto, data))
-
-
+INNER = onnx.helper.make_graph([], "inner", [], [])
+STATE = {"size": 4, "start": 0.0, "longest_gap": 1.0}
 REFUSED = {
-    "sectors": (changed(["scan", "sectors"], 36, True), "scan.sectors"),
-    "no rate": (changed(["control_period"], 0.0, True), "control_period"),
-    "task option": (
-        changed(["task", "options", "goal_radius"], 3.0, True),
-        "task.sha256",
-    ),
-    "other format": (changed(["format"], "nics_drl_bridge/policy/9", True), "format"),
-    "size": (changed(["observation", "size"], 31, True), "observation.size"),
-    "missing": (contract_without("robot"), "robot"),
+    "sectors": (contract("scan.sectors", 36), "scan.sectors"),
+    "no rate": (contract("control_period", 0.0), "control_period"),
+    "task option": (contract("task.options.goal_radius", 3.0), "task.sha256"),
+    "other format": (contract("format", "nics_drl_bridge/policy/9"), "format"),
+    "size": (contract("observation.size", 31), "observation.size"),
+    "missing": (contract("robot"), "robot"),
+    # Commands beyond the limits of the robot.
+    "a weaker robot": (contract("robot.command.0.max", 0.01), "robot.command"),
+    "a state that the graph does not take": (contract("state", STATE), "graph.inputs"),
     "NaN in JSON": (text('{"format": NaN}'), "metadata"),
     "a key twice": (text('{"a": 1, "a": 2}'), "metadata"),
     "no contract": (no_contract, "metadata"),
-    "NaN weights": (weights(np.nan), "weights."),
-    "other weights": (weights(0.5, resigned=False), "graph_sha256"),
-    "other weights signed": (weights(5.0), "golden."),
-    "external data": (elsewhere("weights.bin"), "weights."),
-    "own operator": (node("Evil", "com.example"), "graph.node"),
-    "graph in a node": (branch, "graph.node"),
-    "function": (function, "graph"),
-    "input name": (end("input", "obs"), "graph"),
-    "output name": (end("output", "mean"), "graph"),
-    "input type": (doubles, "graph"),
-    "golden action": (golden("actions", (0, 0)), "golden.actions"),
-    "golden cut": (changed(["golden", "actions"], "AAAA", True), "golden.actions"),
-    "limits of a weaker robot": (loud, "robot.command"),
-    "a state that the graph does not take": (stateful, "graph.inputs"),
+    "NaN weights": (graph(lambda proto: set_weight(proto, np.nan)), "weights."),
+    "other weights": (other_weights, "graph_sha256"),
+    "other weights signed": (graph(lambda proto: set_weight(proto, 5.0)), "golden."),
+    "external data": (graph(move_weights), "weights."),
+    "own operator": (
+        graph(lambda proto: add_node(proto, "Evil", "com.example")),
+        "graph.node",
+    ),
+    "graph in a node": (
+        graph(lambda proto: add_node(proto, "Identity", body=INNER)),
+        "graph.node",
+    ),
+    "function": (graph(add_function), "graph"),
+    "input name": (graph(lambda p: setattr(p.graph.input[0], "name", "o")), "graph"),
+    "output name": (graph(lambda p: setattr(p.graph.output[0], "name", "o")), "graph"),
+    "input type": (graph(take_doubles), "graph"),
+    "golden action": (spoil_golden, "golden.actions"),
+    "golden cut": (contract("golden.actions", "AAAA"), "golden.actions"),
     "pickle": (lambda _: pickle.dumps({"weights": [1.0]}), "file"),
     "zip of Stable-Baselines3": (lambda _: b"PK\x03\x04" + bytes(99), "file"),
     "text": (lambda _: b"format: policy\n" * 20, "file"),
 }
 REFUSED_STATES = {
-    "none": (contract_without("state"), "graph.inputs"),
-    "another size": (changed(["state", "size"], 5, True), "graph"),
-    "another start": (changed(["state", "start"], 0.5, True), "golden.actions"),
-    "not passed on": (forgetful, "golden.actions"),
+    "none": (contract("state"), "graph.inputs"),
+    "another size": (contract("state.size", 5), "graph"),
+    "another start": (contract("state.start", 0.5), "golden.actions"),
+    "not passed on": (graph(forget), "golden.actions"),
 }
 CASES = [("file", name, REFUSED) for name in REFUSED]
 CASES += [("remembering", name, REFUSED_STATES) for name in REFUSED_STATES]

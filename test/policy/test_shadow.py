@@ -173,16 +173,26 @@ def test_figures_are_those_of_the_definition():
     [
         ({"scan": "/scna"}, None, 4.0, "/scna"),
         ({}, None, 0.0, "--ahead 0"),
-        ({}, (0.0, 0.0), 4.0, "nothing to compare"),
+        ({}, (0.0, 0.0), 4.0, "nothing to compare"),  # at the goal all the time
     ],
 )
-def test_what_can_not_be_compared_is_told(recorded, topics, goal, ahead, words):
-    _, bag, _ = recorded
-    if goal is not None:  # at the goal all the time
-        bag = bags.write(bag.parent / "standing", driven_standing())
-        goal = (0.0, 0.0)
+def test_what_can_not_be_compared_is_told(standing, topics, goal, ahead, words):
+    model = builtin_model("ackermann")
     with pytest.raises((RecordingError, ConfigError), match=words):
-        shadow(bag, builtin_model("ackermann"), "dynamic_window", topics, goal, ahead)
+        shadow(standing, model, "dynamic_window", topics, goal, ahead)
+
+
+def test_a_bag_without_commands_is_refused(tmp_path):
+    topics = driven_standing()
+    del topics["/cmd_vel"]
+    bag = bags.write(tmp_path / "bag", topics)
+    with pytest.raises(RecordingError, match="has no cmd_vel"):
+        shadow(bag, builtin_model("ackermann"), "dynamic_window", {})
+
+
+@pytest.fixture
+def standing(tmp_path):
+    return bags.write(tmp_path / "standing", driven_standing())
 
 
 def driven_standing():
@@ -193,14 +203,6 @@ def driven_standing():
         "/odom": [(t, odometry(t, np.zeros(3), np.zeros(3))) for t in moments],
         "/cmd_vel": [(t, bags.twist(0.0, 0.0, 0.0)) for t in moments],
     }
-
-
-def test_a_bag_without_commands_is_refused(tmp_path):
-    topics = driven_standing()
-    del topics["/cmd_vel"]
-    bag = bags.write(tmp_path / "bag", topics)
-    with pytest.raises(RecordingError, match="has no cmd_vel"):
-        shadow(bag, builtin_model("ackermann"), "dynamic_window", {})
 
 
 def test_the_command_writes_a_table_a_picture_and_json(recorded, tmp_path):

@@ -9,6 +9,7 @@ from stable_baselines3 import PPO, SAC
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import ConfigError, PolicyError
+from nics_drl_bridge.policy.train.algorithms import Actor, make_act
 from nics_drl_bridge.policy.train.export import export_policy
 from policy.policy_rig import (
     SECTORS,
@@ -34,25 +35,49 @@ def observations(env, count=50):
     )
 
 
+def make_algorithm(name, env):
+    """An untrained algorithm whose actions differ, some of them beyond the limits."""
+    if name == "sac":
+        return SAC("MlpPolicy", env, seed=0, buffer_size=10, device="cpu")
+    if name == "ppo":
+        made = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
+        last = made.policy.action_net
+    else:
+        size = env.observation_space.shape[0]
+        scale = np.linspace(-1.0, 1.0, size), np.linspace(0.1, 2.0, size)
+        torch.manual_seed(0)
+        made = Actor(env.observation_space, env.action_space, [16, 8], scale)
+        last = made.layers[-1]
+    with torch.no_grad():
+        last.weight.mul_(500.0)
+    return made
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("env", "name"),
-    [("continuous", "ppo"), ("discrete", "ppo"), ("continuous", "sac")],
+    [
+        ("continuous", "ppo"),
+        ("discrete", "ppo"),
+        ("continuous", "sac"),
+        ("continuous", "lean"),
+        ("discrete", "lean"),
+    ],
     indirect=["env"],
 )
 def test_the_file_of_an_algorithm_acts_as_it_predicts(env, tmp_path, name):
-    if name == "ppo":
-        model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
-        with torch.no_grad():  # actions that have to be cut at the limits
-            model.policy.action_net.weight.mul_(500.0)
-    else:
-        model = SAC("MlpPolicy", env, seed=0, buffer_size=10, device="cpu")
-    policy = export_policy(model, env.task, env.model, tmp_path / "policy.onnx")
+    algorithm = make_algorithm(name, env)
+    policy = export_policy(algorithm, env.task, env.model, tmp_path / "policy.onnx")
     rows = observations(env).astype(np.float32)
-    wanted, _ = model.predict(rows, deterministic=True)
+    if name == "lean":
+        wanted = make_act(algorithm)(rows)
+    else:
+        wanted, _ = algorithm.predict(rows, deterministic=True)
+    if env.task.actions == "continuous":
+        wanted = np.clip(wanted, -1.0, 1.0)
     assert policy.act(rows) == pytest.approx(wanted, abs=1e-5)
     assert policy.command(rows) == pytest.approx(env.task.command(wanted), abs=1e-5)
-    assert len(np.unique(np.round(policy.act(rows), 2))) > 2
+    assert len(np.unique(np.round(policy.act(rows), 2))) > 1 + (name != "lean")
 
 
 def test_the_normaliser_is_inside_the_graph(tmp_path):

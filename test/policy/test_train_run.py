@@ -124,41 +124,34 @@ def test_what_can_not_be_trained_gives_one_sentence(
     assert "Traceback" not in done.output
 
 
-def test_a_misspelt_task_leaves_no_folder_that_refuses_the_right_one(
-    tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.py").write_text("")
-    done = nics("--task", "mine.py:Patrol", "--out", "run")
-    assert "'mine.py:Patrol': mine.py defines no subclass" in " ".join(
-        done.output.split()
-    )
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.parametrize(
-    ("right", "wrong", "sentence"),
+    ("task", "text", "sentence"),
     [
         (
-            '{"near": -',
-            '{"near": np.nan * ',
+            "mine.py:Reach",
+            REACH.replace('{"near": -', '{"near": np.nan * '),
             "task Reach: its reward term 'near' must be finite",
         ),
         (
-            'memory["goal"])}',
-            'memory["gaol"])}',
+            "mine.py:Reach",
+            REACH.replace('memory["goal"])}', 'memory["gaol"])}'),
             "mine.py:17, in reward: KeyError('gaol'); correct",
         ),
+        ("mine.py:Patrol", "", "'mine.py:Patrol': mine.py defines no subclass"),
+        (
+            "cooperative_reaching",
+            "",
+            "task 'cooperative_reaching': has 3 robots; train a single-robot task,",
+        ),
     ],
+    ids=["no number", "an error", "misspelt", "a team"],
 )
-def test_a_task_that_gives_no_numbers_is_refused_before_a_folder_is_begun(
-    tmp_path, monkeypatch, right, wrong, sentence
+def test_a_task_that_can_not_be_learnt_is_refused_before_a_folder_is_begun(
+    tmp_path, monkeypatch, task, text, sentence
 ):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.py").write_text(REACH.replace(right, wrong))
-    done = nics(
-        "--task", "mine.py:Reach", "--world", "empty", "--steps", 64, "--out", "run"
-    )
+    (tmp_path / "mine.py").write_text(text)
+    done = nics("--task", task, "--world", "empty", "--steps", 64, "--out", "run")
     assert done.exit_code == 2
     assert sentence in " ".join(done.output.split())
     assert "Traceback" not in done.output
@@ -177,17 +170,6 @@ def test_a_task_that_tells_no_success_is_said_to(tmp_path, monkeypatch):
     assert done.exit_code == 0, done.output
     assert "does the task's `info` contain `is_success`?" in done.output
     assert "--task mine.py:Reach" in done.output.splitlines()[-1]
-
-
-def test_a_task_of_a_team_is_refused_before_a_folder_is_begun(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    done = nics("--task", "cooperative_reaching", "--steps", 64, "--out", "run")
-    assert done.exit_code == 2
-    assert (
-        "task 'cooperative_reaching': has 3 robots; train a single-robot task,"
-        in done.output
-    )
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("engine", ["lean", "sb3"])

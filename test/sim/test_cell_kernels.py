@@ -58,9 +58,3 @@ def test_bodies_that_are_put_in_order_are_the_same_and_found_among_those_that_mo
             assert within(bodies, spot, 1.0) | set(range(70, 80)) <= set(got)
             few += len(got) < 40
     assert few > 0
-
-
-def test_without_cells_all_bodies_are_found():
-    cells = kernels.body_cells(0, 5)
-    assert kernels.find_around(0, 50.0, 50.0, 0.1, cells) == 5
-    assert cells.found.tolist() == [0, 1, 2, 3, 4]

@@ -14,21 +14,20 @@ from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import load_worlds
 
 LIDAR = load_lidar("rplidar_a2")
-WORLDS = ["arena", "clutter", "room", "corridor", "doorway"]
 
 
 def world_of(**keys):
     return World.model_validate({"name": "made", "goal_distance": (0.0, 1.0), **keys})
 
 
-def agreement(name, seed, spare=()):
+def agreement(name, seed):
     """Share of beams whose end in the map is within a cell of what the beams beside it show."""
     worlds = load_worlds(name)
     sampler = SceneSampler(worlds, 0.2)
     scene = sampler.draw([seed])[0]
     world = worlds.members[int(scene.member)]
     placed = standing(sampler, int(scene.member), scene.bodies)
-    grid = occupancy(world, [each for k, each in enumerate(placed) if k not in spare])
+    grid = occupancy(world, placed)
     shapes = [shape for shape, _ in placed]
     exact = make_scanner(LIDAR, shapes, "exact", world.grid)
     mapped = make_scanner(LIDAR, [], "exact", grid)
@@ -47,7 +46,7 @@ def agreement(name, seed, spare=()):
     )
 
 
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("name", ["clutter", "room"])
 def test_beams_in_the_map_end_where_they_end_in_the_world(name):
     assert agreement(name, 3) > 0.995
 

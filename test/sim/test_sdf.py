@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 
@@ -10,10 +9,10 @@ import pytest
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle
 from nics_drl_bridge.sim import sdf
+from nics_drl_bridge.sim.barn import barn_world
 from nics_drl_bridge.sim.sdf import read_sdf
 
 HERE = Path(__file__).parent / "gazebo"
-BARN = Path("/work/shared/barn")
 HEIGHT = 0.2
 DISC = "<cylinder><radius>0.1</radius><length>1</length></cylinder>"
 POINT = "<polyline><point>0 0</point><height>1</height></polyline>"
@@ -66,25 +65,17 @@ def refused(file, **options):
     return sentence.removeprefix(str(file))
 
 
-@pytest.fixture(scope="module")
-def rows():
-    """World, x, y (rows, 3) of the cylinders of a benchmark, as its authors gave them."""
-    if not BARN.is_dir():
-        pytest.skip("the benchmark's worlds are not on this machine")
-    with (BARN / "cylinders.csv").open() as file:
-        return np.array(
-            [[float(value) for value in row] for row in list(csv.reader(file))[1:]]
-        )
-
-
-@pytest.mark.parametrize("number", [1, 2, 50, 151, 200, 299])
-def test_every_cylinder_of_a_published_world_is_found_where_it_stands(rows, number):
-    (group,) = read_sdf(BARN / "gazebo" / f"world_{number}.world", HEIGHT).obstacles
-    found = np.array(group.at)[:, :2]
-    expected = rows[rows[:, 0] == number, 1:]
-    found, expected = (one[np.lexsort(np.round(one, 3).T)] for one in (found, expected))
-    assert found == pytest.approx(expected, abs=1e-3)
-    assert group.shapes == (Circle(radius=0.075),)
+@pytest.mark.parametrize("number", [1, 50, 299])
+def test_every_cylinder_of_a_published_world_is_found_where_it_stands(
+    shared_barn, number
+):
+    file = shared_barn / "gazebo" / f"world_{number}.world"
+    (group,) = read_sdf(file, HEIGHT).obstacles
+    expected = barn_world(number).obstacles[0]
+    found, wanted = (np.array(each.at)[:, :2] for each in (group, expected))
+    found, wanted = (one[np.lexsort(np.round(one, 3).T)] for one in (found, wanted))
+    assert found == pytest.approx(wanted, abs=1e-3)
+    assert group.shapes == expected.shapes
 
 
 def test_frames_degrees_nested_and_included_models_stand_where_their_names_say():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from lidar_scenes import scan_skewed, slice_poses
-from robots import FOOTPRINT, RADIUS, direct_model, field, lidar
+from robots import FOOTPRINT, RADIUS, direct_model, field, lidar, noisy_model
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
@@ -19,17 +19,10 @@ from nics_drl_bridge.sim.simulator import (
     FastSimulator,
     OutsideValidityWarning,
 )
-from nics_drl_bridge.sim.state import State
 from nics_drl_bridge.sim.world import load_world
 
 ORIGIN = np.zeros((1, 1, 3))
 PERIOD = 0.1
-OVERLAP = 1e-6
-"""So deep may a robot be in what it touches [m]."""
-
-
-def noisy_model(**changes):
-    return direct_model(odometry=(0.05, 0.03), sensor=lidar(noise_std=0.01, **changes))
 
 
 def drive(simulator, seeds, commands, starts=None):
@@ -51,11 +44,8 @@ def random_commands(model, steps, worlds, robots, seed=0):
     return rng.uniform(low, high, (steps, worlds, robots, len(low)))
 
 
-ALL = State._fields
-
-
 def test_beginning_one_world_anew_leaves_the_others_alone():
-    model = noisy_model()
+    model = noisy_model()  # has commands on their way
     world = field(5.0, count=3)
     commands = random_commands(model, 10, 3, 1)
     simulator = FastSimulator(model, world, 3)
@@ -89,15 +79,6 @@ def test_a_command_takes_effect_after_exactly_its_latency(latency):
         newest = np.floor((now - 0.01 - latency) / PERIOD + 1e-9)
         speed = commands[int(newest), 0, 0, 0] if newest >= 0 else 0.0
         assert data["twist"][0, 0, 0] == pytest.approx(speed)
-
-
-def test_a_reset_forgets_commands_on_their_way():
-    simulator = FastSimulator(direct_model(latency=0.3), field())
-    drive(simulator, [0], np.ones((2, 1, 1, 3)), ORIGIN)
-    simulator.reset([0], starts=ORIGIN)
-    for _ in range(5):
-        simulator.step(np.zeros((1, 1, 3)))
-    assert not simulator.data.pose.any()
 
 
 def test_robots_move_as_the_readable_model_does():
@@ -162,46 +143,34 @@ def test_without_noise_odometry_is_the_truth():
     assert data["twist"] == pytest.approx(commands[-1])
 
 
-def test_odometry_drifts_with_the_configured_deviation():
-    worlds = 1000
-    steps = 25
-    deviation = np.array([0.05, 0.05, 0.03])
-    simulator = FastSimulator(direct_model(odometry=(0.05, 0.03)), field(), worlds)
-    starts = np.zeros((worlds, 1, 3))
-    history = drive(simulator, range(worlds), np.zeros((steps, worlds, 1, 3)), starts)
-    twists = np.array([data["twist"][:, 0] for data in history])
-    assert twists.std(axis=(0, 1)) == pytest.approx(deviation, rel=0.03)
-    # Each period draws again, independent of the one before.
-    final = history[-1]["odom"][:, 0].std(axis=0)
-    assert final == pytest.approx(deviation * PERIOD * np.sqrt(steps), rel=0.1)
-    assert not history[-1]["pose"].any()
-
-
-def test_goals_are_those_of_the_scene():
-    simulator = FastSimulator(direct_model(), field(), 2)
-    scenes = simulator.reset([5, 6])
-    assert np.array_equal(simulator.goals, [scene.goals for scene in scenes])
+SPARE = field(40.0).with_spare((Circle(radius=0.1),) * 100)
+MANY = Randomisation(name="many", obstacles={"count": (0, 100)})
+NEEDS_ONE = "at least 1 world, robot and thread"
+TOO_MUCH = "copies of .* fit in memory"
 
 
 @pytest.mark.parametrize(
-    ("worlds", "robots", "options", "match"),
+    ("match", "options"),
     [
-        (0, 1, {}, "at least 1 world, robot and thread"),
-        (1, 0, {}, "at least 1 world, robot and thread"),
-        (1, 1, {"threads": 0}, "at least 1 world, robot and thread"),
-        (1, 1, {"longest_delay": -1}, "longest_delay of at least"),
-        (1, 1, {"longest_age": -1}, "longest_age of at least 0"),
-        (1, 10**9, {}, "1000000000 robots: a world may have at most 1000"),
-        (10**9, 1, {}, "copies of it fit in memory"),
-        (10**4, 1, {"longest_age": 10**6}, "copies of it fit in memory"),
-        (10**4, 1, {"longest_delay": 10**6}, "copies of it fit in memory"),
+        (NEEDS_ONE, {"worlds": 0}),
+        (NEEDS_ONE, {"robots": 0}),
+        (NEEDS_ONE, {"threads": 0}),
+        ("longest_delay of at least", {"longest_delay": -1}),
+        ("longest_age of at least 0", {"longest_age": -1}),
+        ("1000000000 robots: a world may have at most 1000", {"robots": 10**9}),
+        (TOO_MUCH, {"worlds": 10**9}),
+        (TOO_MUCH, {"worlds": 10**4, "longest_age": 10**6}),
+        (TOO_MUCH, {"worlds": 10**4, "longest_delay": 10**6}),
+        (TOO_MUCH, {"worlds": 300_000, "world": SPARE}),
+        (TOO_MUCH, {"worlds": 300_000, "randomisation": MANY}),
     ],
 )
 def test_sizes_that_no_simulator_has_are_refused_before_anything_is_made(
-    worlds, robots, options, match
+    match, options
 ):
+    given = {"world": field(40.0, count=1), **options}
     with pytest.raises(ConfigError, match=match):
-        FastSimulator(direct_model(), field(), worlds, robots, **options)
+        FastSimulator(direct_model(), **given)
 
 
 def test_commands_of_another_shape_are_refused():
@@ -209,18 +178,6 @@ def test_commands_of_another_shape_are_refused():
     for step in (simulator.step, lambda x: simulator.step_part(simulator.parts[0], x)):
         with pytest.raises(ConfigError, match=r"must be \(3, 1, 3\)"):
             step(np.zeros((2, 1, 3)))
-
-
-def test_obstacles_that_are_spare_or_drawn_count_for_memory():
-    model = direct_model()
-    copies = 300_000
-    refused = "300000 copies of .* fit in memory"
-    spare = field(40.0).with_spare((Circle(radius=0.1),) * 100)
-    with pytest.raises(ConfigError, match=refused):
-        FastSimulator(model, spare, copies)
-    many = Randomisation(name="many", obstacles={"count": (0, 100)})
-    with pytest.raises(ConfigError, match=refused):
-        FastSimulator(model, field(40.0, count=1), copies, randomisation=many)
 
 
 @pytest.mark.parametrize(
@@ -249,7 +206,7 @@ FAST = np.array([[[1.0, 0.0, 0.0]]])
 def test_each_command_outside_the_fit_is_reported_once_whatever_is_reset():
     told: list[str] = []
     simulator = FastSimulator(
-        narrow_model(), field(40.0), 4, threads=2, tell=told.append
+        narrow_model(), field(40.0), 4, threads=2, warn=told.append
     )
     simulator.reset(range(4))
     for worlds in ([3], [0], [0, 1, 2, 3]):
@@ -269,12 +226,16 @@ def test_the_warning_names_the_line_that_steps():
     assert warned[0].filename == __file__
 
 
-def test_equal_shapes_come_back_as_the_first_of_them():
+@pytest.mark.parametrize("count", [2, 40])
+def test_a_reset_gives_the_scene_that_was_drawn_and_equal_shapes_as_the_first(count):
     disc = Circle(radius=RADIUS)
-    world = field(8.0, count=2).with_spare((disc, disc))
+    world = field(12.0, count=count).with_spare((disc, disc))
     simulator = FastSimulator(direct_model(), world)
     scenes = simulator.reset([0])
     assert np.array_equal(scenes.bodies, simulator.obstacles)
+    drawn = simulator.scenes([0])
+    assert np.array_equal(np.sort(scenes.bodies, axis=1), np.sort(drawn.bodies, axis=1))
+    assert np.array_equal(drawn.goals, simulator.goals)
 
 
 def test_putting_a_robot_or_obstacles_leaves_the_order_of_other_worlds_alone():

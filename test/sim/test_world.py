@@ -5,7 +5,8 @@ import shutil
 import numpy as np
 import pytest
 import shapely
-from robots import circles, field
+import yaml
+from robots import field
 
 from nics_drl_bridge.config import share_folder, validate
 from nics_drl_bridge.errors import ConfigError
@@ -20,26 +21,17 @@ def walls_of(world):
     return shapely.multilinestrings(world.all_walls().reshape(-1, 2, 2))
 
 
-def test_a_world_of_a_map_alone_has_no_other_walls_and_the_extent_of_the_map():
-    world = World(name="map", map="room", goal_distance=(1.0, 2.0))
+@pytest.mark.parametrize(
+    ("place", "extent"),
+    [
+        ({"map": "room"}, (-3.0, -4.0, 7.0, 4.0)),
+        ({"bounds": (1.0, 2.0, 4.0, 9.0)}, (1.0, 2.0, 4.0, 9.0)),
+    ],
+)
+def test_a_map_alone_or_bounds_say_where_a_world_lies_and_have_no_walls(place, extent):
+    world = World(name="open", goal_distance=(1.0, 2.0), **place)
     assert world.all_walls().shape == (0, 4)
-    assert world.extent == pytest.approx((-3.0, -4.0, 7.0, 4.0))
-    assert np.array_equal(world.grid.cells, load_map("room").cells)
-
-
-def test_a_field_of_bounds_has_no_walls_and_lies_where_they_say():
-    world = World(name="open", bounds=(1.0, 2.0, 4.0, 9.0), goal_distance=(1.0, 2.0))
-    assert world.all_walls().shape == (0, 4)
-    assert world.extent == (1.0, 2.0, 4.0, 9.0)
-
-
-def test_bounds_are_part_of_the_fingerprint_of_the_worlds_that_have_them():
-    assert load_world("arena").fingerprint == "arena-261566ec"
-    fields = [
-        World(name="open", bounds=(0.0, 0.0, 6.0, y), goal_distance=(1.0, 2.0))
-        for y in (6.0, 7.0)
-    ]
-    assert fields[0].fingerprint != fields[1].fingerprint
+    assert world.extent == pytest.approx(extent)
 
 
 def test_wall_distance_is_that_of_plane_geometry():
@@ -53,14 +45,17 @@ def test_wall_distance_is_that_of_plane_geometry():
 
 
 def test_worlds_of_equal_content_share_a_fingerprint_and_others_do_not():
+    assert load_world("arena").fingerprint == "arena-261566ec"
     assert field().fingerprint == field().fingerprint
     others = [
         field(5.0),
         field(count=1),
         field(walls=[[0.0, 0.0, 1.0, 0.0]]),
+        field(None, bounds=(0.0, 0.0, 6.0, 6.0)),
+        field(None, bounds=(0.0, 0.0, 6.0, 7.0)),
         load_world("room"),
     ]
-    assert len({world.fingerprint for world in (field(), *others)}) == 5
+    assert len({world.fingerprint for world in (field(), *others)}) == 7
 
 
 @pytest.fixture
@@ -75,14 +70,12 @@ def own_world(tmp_path):
     return file
 
 
-def test_a_map_is_looked_for_from_the_folder_of_the_world_file(own_world):
-    assert np.array_equal(load_world(str(own_world)).grid.cells, load_map("room").cells)
-
-
-def test_the_fingerprint_changes_with_the_content_of_the_map_but_not_with_its_path(
+def test_a_map_lies_beside_its_world_and_its_content_counts_in_the_fingerprint(
     own_world,
 ):
-    before = load_world(str(own_world)).fingerprint
+    own = load_world(str(own_world))
+    assert np.array_equal(own.grid.cells, load_map("room").cells)
+    before = own.fingerprint
     named = World(name="room", map="room", goal_distance=(1.0, 2.0))
     assert before == named.fingerprint
     picture = own_world.parent / "maps" / "room.pgm"
@@ -103,50 +96,58 @@ def test_a_missing_map_is_refused_when_the_world_is_loaded(own_world):
         load_world(str(own_world))
 
 
-NO_FIELD = {"size": None}
+ROUND = "shapes: [{kind: circle, radius: 0.2}]"
+NOT_BOTH = "either `count` or `at`"
+WRONG_RADIUS = "'obstacles.0.shapes.0.circle.radius'"
 
 
 @pytest.mark.parametrize(
-    ("changes", "key"),
+    ("text", "key"),
     [
-        ({"size": [0.0, 3.0]}, "'size.0'"),
-        ({"size": [1e12, 1e12]}, "'size.0'"),
-        (NO_FIELD, "needs a `size`"),
-        ({"bounds": [0.0, 0.0, 1.0, 1.0]}, "either a `size` (with walls)"),
-        (NO_FIELD | {"bounds": [1.0, 0.0, 0.0, 1.0]}, "bounds must be"),
-        (NO_FIELD | {"bounds": [0.0, 0.0, 1.0, 2e4]}, "bounds must be"),
-        (NO_FIELD | {"bounds": [0.0, 0.0, 4e3, 4e3]}, "5657 m across"),
-        ({"goal_distance": [3.0, 1.0]}, "goal_distance must be"),
-        ({"goal_distance": [1.0, 1e308]}, "'goal_distance.1'"),
-        ({"obstacles": [circles(1, (0.0,))]}, "'obstacles.0.shapes.0.circle.radius'"),
-        ({"obstacles": [circles(1, (1e308,))]}, "'obstacles.0.shapes.0.circle.radius'"),
-        ({"obstacles": [circles(1, ())]}, "'obstacles.0.shapes'"),
-        ({"obstacles": [circles(-1)]}, "'obstacles.0.count'"),
-        ({"obstacles": [circles([3, 1])]}, "'obstacles.0.count'"),
-        ({"obstacles": [circles("many")]}, "'obstacles.0.count'"),
-        ({"obstacles": [circles(10**9)]}, "'obstacles.0.count'"),
+        ("size: [0.0, 3.0]", "'size.0'"),
+        ("size: [1.0e+12, 3.0]", "'size.0'"),
+        ("size: null", "needs a `size`"),
+        ("bounds: [0, 0, 1, 1]", "either a `size` (with walls)"),
+        ("{size: null, bounds: [1, 0, 0, 1]}", "bounds must be"),
+        ("{size: null, bounds: [0, 0, 1, 2.0e+4]}", "bounds must be"),
+        ("{size: null, bounds: [0, 0, 4000, 4000]}", "5657 m across"),
+        ("goal_distance: [3.0, 1.0]", "goal_distance must be"),
+        ("goal_distance: [1.0, 1.0e+308]", "'goal_distance.1'"),
+        ("obstacles: [{shapes: [{kind: circle, radius: 0}], count: 1}]", WRONG_RADIUS),
+        ("obstacles: [{shapes: [{kind: circle, radius: 1.0e+308}]}]", WRONG_RADIUS),
+        ("obstacles: [{shapes: [], count: 1}]", "'obstacles.0.shapes'"),
+        (f"obstacles: [{{{ROUND}, count: -1}}]", "'obstacles.0.count'"),
+        (f"obstacles: [{{{ROUND}, count: [3, 1]}}]", "'obstacles.0.count'"),
+        (f"obstacles: [{{{ROUND}, count: many}}]", "'obstacles.0.count'"),
+        (f"obstacles: [{{{ROUND}, count: 1000000000}}]", "'obstacles.0.count'"),
         (
-            {"obstacles": [circles(9_000), circles(9_000)]},
+            f"obstacles: [{{{ROUND}, count: 9000}}, {{{ROUND}, count: 9000}}]",
             "together may have at most 10000",
         ),
-        ({"obstacles": [circles(1) | {"at": [[0.0] * 3]}]}, "either `count` or `at`"),
-        ({"obstacles": [{"shapes": [CIRCLE]}]}, "either `count` or `at`"),
-        ({"obstacles": [circles(1, gap=1e300)]}, "'obstacles.0.gap'"),
-        ({"obstacles": [circles(1) | {"gab": 0.1}]}, "did you mean 'gap'"),
-        ({"obstacles": [circles(None) | {"at": [[1, 1, -90]]}]}, "in radians"),
-        ({"walls": [[0.0, 1.0]]}, "'walls.0"),
-        ({"walls": [[0.0, 0.0, 1.0, 1.0]] * 20_000}, "'walls'"),
-        ({"starts": {}}, "either `regions` or `at`"),
-        ({"starts": {"regions": [[1e300] * 4]}}, "'starts.regions.0.0'"),
-        ({"goals": {"at": [[0.0, 0.0, 0.0]]}}, "'goals.at.0"),
+        (f"obstacles: [{{{ROUND}, count: 1, at: [[0, 0, 0]]}}]", NOT_BOTH),
+        (f"obstacles: [{{{ROUND}}}]", NOT_BOTH),
+        (f"obstacles: [{{{ROUND}, count: 1, gap: 1.0e+300}}]", "'obstacles.0.gap'"),
+        (f"obstacles: [{{{ROUND}, count: 1, gab: 0.1}}]", "did you mean 'gap'"),
+        (f"obstacles: [{{{ROUND}, at: [[1, 1, -90]]}}]", "in radians"),
+        ("walls: [[0.0, 1.0]]", "'walls.0"),
+        ("starts: {}", "either `regions` or `at`"),
+        ("starts: {regions: [[1.0e+300, 0, 0, 0]]}", "'starts.regions.0.0'"),
+        ("goals: {at: [[0, 0, 0]]}", "'goals.at.0"),
     ],
 )
-def test_a_world_that_cant_be_is_refused_by_the_key(changes, key):
+def test_a_world_that_cant_be_is_refused_by_the_key(text, key):
+    content = field().model_dump(mode="json") | yaml.safe_load(text)
     with pytest.raises(ConfigError) as caught:
-        validate(field().model_dump(mode="json") | changes, World, "world.yaml")
+        validate(content, World, "world.yaml")
     assert key in str(caught.value)
     assert str(caught.value).startswith("world.yaml: ")
     assert len(str(caught.value)) < 400
+
+
+def test_a_world_of_too_many_walls_is_refused_by_the_key():
+    content = field().model_dump() | {"walls": [[0.0, 0.0, 1.0, 1.0]] * 20_000}
+    with pytest.raises(ConfigError, match="'walls'"):
+        validate(content, World, "world.yaml")
 
 
 def patrolled(*waypoints):

@@ -1,11 +1,9 @@
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import pytest
 import yaml
-from robots import circles, direct_model, field, lidar
+from robots import circles, field, noisy_model
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
@@ -14,7 +12,7 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 from nics_drl_bridge.sim.world_set import WorldSet, load_worlds
 
-MODEL = direct_model(odometry=(0.05, 0.03), sensor=lidar(noise_std=0.01))
+MODEL = noisy_model()
 MIXED = WorldSet(
     "mixed", tuple(load_world(n) for n in ("crowd", "room", "doorway", "circles"))
 )
@@ -62,16 +60,6 @@ def test_an_episode_in_a_set_is_that_of_its_member_alone_to_the_bit(renderer, ro
         alone = drive(member, seeds[rows], given[:, rows], renderer=renderer)
         for one, other in zip(together, alone, strict=True):
             assert np.array_equal(one[:, rows], other)
-
-
-def test_a_copy_of_a_simulator_goes_on_in_the_same_members():
-    simulator = FastSimulator(MODEL, MIXED, 4)
-    simulator.reset(range(4))
-    other = copy.deepcopy(simulator)
-    for each in commands(4):
-        simulator.step(each)
-        other.step(each)
-    assert np.array_equal(simulator.data.ranges, other.data.ranges)
 
 
 def test_every_member_has_the_same_chance():

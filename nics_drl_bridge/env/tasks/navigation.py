@@ -164,13 +164,7 @@ class Navigation(Task):
         ) -> tuple[Observation, dict[str, float], bool, Info]:
             goals[0] = memory["goal"]
             navigate()
-            progress, time, success, collision, _ = terms.tolist()
-            paid = {
-                "progress": progress,
-                "time": time,
-                "success": success,
-                "collision": collision,
-            }
+            paid = dict(zip(TERMS, terms.tolist(), strict=False))
             _, touched, succeeded, ended = flags.tolist()
             facts = {"is_success": succeeded, "collision": touched}
             return observation.copy(), paid, ended, facts

@@ -15,7 +15,7 @@ from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, PolicyError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.arrays import AnyArray
-from nics_drl_bridge.lidar.sectors import plan_of
+from nics_drl_bridge.lidar.sectors import make_sector_plan
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.policy.file import contract as contracts
 from nics_drl_bridge.policy.file import onnx_graph, rehearsal
@@ -58,21 +58,9 @@ class PolicyFile:
         Raises PolicyError for a wrong shape or a missing state; see `make_policy`.
         """
         rows = np.asarray(observation, np.float32)
-        size = self.contract.observation.size
         kept = self.contract.state
-        if rows.ndim not in (1, 2) or rows.shape[-1] != size:
-            raise PolicyError(
-                str(self.path),
-                "observation.size",
-                f"is {size}, but observations are {rows.shape}; use the policy's own task.",
-            )
-        wanted = None if kept is None else (*rows.shape[:-1], kept.size)
-        if wanted != (None if state is None else np.shape(state)):
-            reason = f"must have shape {wanted}, not {None if state is None else np.shape(state)}"
-            raise PolicyError(
-                str(self.path), "state", f"{reason}; `make_policy` keeps it."
-            )
-        tensors = [rows.reshape(-1, size)]
+        self._check_shapes(rows.shape, None if state is None else np.shape(state))
+        tensors = [rows.reshape(-1, rows.shape[-1])]
         if kept is not None:
             tensors.append(np.asarray(state, np.float32).reshape(-1, kept.size))
         step = self.contract.batch or onnx_graph.MOST_ROWS
@@ -80,6 +68,25 @@ class PolicyFile:
         out = [self._run(*(part[k : k + step] for part in tensors)) for k in firsts]
         whole = [np.concatenate(parts) for parts in zip(*out, strict=True)]
         return [part[0] if rows.ndim == 1 else part for part in whole]
+
+    def _check_shapes(
+        self, rows: tuple[int, ...], state: tuple[int, ...] | None
+    ) -> None:
+        """Raises PolicyError for another shape of observations or states, None without any."""
+        size = self.contract.observation.size
+        if len(rows) not in (1, 2) or rows[-1] != size:
+            raise PolicyError(
+                str(self.path),
+                "observation.size",
+                f"is {size}, but observations are {rows}; use the policy's own task.",
+            )
+        kept = self.contract.state
+        wanted = None if kept is None else (*rows[:-1], kept.size)
+        if state != wanted:
+            reason = f"must have shape {wanted}, not {state}"
+            raise PolicyError(
+                str(self.path), "state", f"{reason}; `make_policy` keeps it."
+            )
 
     def _run(self, rows: Rows, *state: Rows) -> list[AnyArray]:
         out = self._run_network(rows, *state)
@@ -158,7 +165,7 @@ class PolicyFile:
             theirs["lidar"] = lidar.model_dump(mode="json", include=LIDAR)
         else:
             try:
-                plan_of(lidar, self.contract.scan)
+                make_sector_plan(lidar, self.contract.scan)
             except ConfigError as error:
                 reason = f"does not suit this lidar: {error.reason}"
                 raise PolicyError(
@@ -262,9 +269,12 @@ def _check_ends(contract: Contract, session: Any, source: str) -> None:
 def _check_golden(policy: PolicyFile, source: str) -> None:
     golden = policy.contract.golden
     state = policy.contract.state
-    commands = len(policy.contract.robot.command)
-    actions = 1 if policy.contract.actions == "discrete" else commands
-    for name, width in (("actions", actions), ("commands", commands)):
+    robot = policy.contract.robot
+    discrete = policy.contract.actions == "discrete"
+    for name, width in (
+        ("actions", 1 if discrete else len(robot.command)),
+        ("commands", len(robot.command)),
+    ):
         columns = golden.rows(name).shape[1]
         if columns != width:
             raise PolicyError(
@@ -274,28 +284,30 @@ def _check_golden(policy: PolicyFile, source: str) -> None:
             )
     start = None if state is None else np.full(state.size, state.start, np.float32)
     action, command = run_in_turn(policy.run, golden.rows("observations"), start)
-    computed = {"actions": action.reshape(len(command), -1), "commands": command}
-    for name, rows in computed.items():
-        wanted = golden.rows(name)
-        if rows.shape != wanted.shape:
-            raise PolicyError(
-                source,
-                f"golden.{name}",
-                f"have shape {wanted.shape}, but the graph's outputs {rows.shape}.",
-            )
-        gap = np.abs(rows - wanted).max()
-        if not gap <= GOLDEN_TOLERANCE:
-            raise PolicyError(
-                source,
-                f"golden.{name}",
-                f"differ by {gap:.3g} from the graph's outputs on this machine; not used.",
-            )
-    robot = policy.contract.robot
-    beyond = (command < robot.command_low - GOLDEN_TOLERANCE).any()
-    if beyond or (command > robot.command_high + GOLDEN_TOLERANCE).any():
+    for name, rows in (
+        ("actions", action.reshape(len(command), -1)),
+        ("commands", command),
+    ):
+        reason = _explain_gap(golden.rows(name), rows)
+        if reason:
+            raise PolicyError(source, f"golden.{name}", reason)
+    if (
+        (command < robot.command_low - GOLDEN_TOLERANCE)
+        | (command > robot.command_high + GOLDEN_TOLERANCE)
+    ).any():
         raise PolicyError(
             source, "robot.command", "the graph returns commands beyond these limits."
         )
+
+
+def _explain_gap(golden: Rows, rows: AnyArray) -> str:
+    """Returns how golden rows differ from the outputs of the graph; "" if they agree."""
+    if rows.shape != golden.shape:
+        return f"have shape {golden.shape}, but the graph's outputs {rows.shape}."
+    gap = np.abs(rows - golden).max()
+    if gap <= GOLDEN_TOLERANCE:
+        return ""
+    return f"differ by {gap:.3g} from the graph's outputs on this machine; not used."
 
 
 def summary(policy: PolicyFile) -> dict[str, Any]:

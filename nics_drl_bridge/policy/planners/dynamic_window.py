@@ -72,23 +72,16 @@ class DynamicWindow:
         lag = max((value for name, value in lags if name.endswith("_lag")), default=0.0)
         if self.model is None:
             period = 0.1
-            late = 0.0
+            latency = 0.0
             braking = Braking(lag, math.inf)
         else:
             period = self.model.control_period
-            late = max(0.0, self.model.calibration.command_latency_s)
+            latency = max(0.0, self.model.calibration.command_latency_s)
             limits = self.task.command_limits
             braking = find_braking(self.task.robot, self.model.kinematics, *limits)
-        # The window includes at least one step of the grid.
-        share = 1.0 - math.exp(-period / lag) if lag > 0.0 else 1.0
-        steps = [
-            np.diff(np.unique(speeds.round(6))).max(initial=0.0)
-            for speeds in self.twists.T
-        ]
-        reach = np.maximum(share * np.ptp(self.twists, axis=0), steps) + 1e-6
         # A twist is held for a period and judged a period later; then the robot reacts. The
         # reaction time is known only to within a step of the robot's model, so it is rounded.
-        held = 2.0 * period + late
+        held = 2.0 * period + latency
         reaction = held + round(braking.reaction_s, 2)
         turn_reaction = 0.0
         turn_slowness = 0.0
@@ -105,7 +98,7 @@ class DynamicWindow:
             seen = min(self.task.sight.range_max, maps.MOST_M)
             far = min(self._fastest * step * count, seen)
         return LookAhead(
-            reach,
+            self._find_reach(period, lag),
             step,
             count,
             reaction,
@@ -115,6 +108,17 @@ class DynamicWindow:
             turn_slowness,
             far,
         )
+
+    def _find_reach(self, period: float, lag: float) -> Array:
+        """Returns how far each part of the twist (3,) may change within a period [s]."""
+        fraction = 1.0 - math.exp(-period / lag) if lag > 0.0 else 1.0
+        # The window includes at least one step of the grid.
+        steps = [
+            np.diff(np.unique(speeds.round(6))).max(initial=0.0)
+            for speeds in self.twists.T
+        ]
+        within_lag = fraction * np.ptp(self.twists, axis=0)
+        return np.asarray(np.maximum(within_lag, steps) + 1e-6)
 
     @cached_property
     def _situation(self) -> Situation:

@@ -54,8 +54,8 @@ def choose_twists(
         maps.map_scan(scans[n], goals[n], around)
         twist = twists[n]
         # If braking takes time, a robot that could no longer stop one period later must stop now.
-        late = brakes and math.hypot(twist[0], twist[1]) > MOVING
-        late = late and find_cost(around, twist, twist, ahead) > INADMISSIBLE
+        must_stop = brakes and math.hypot(twist[0], twist[1]) > MOVING
+        must_stop = must_stop and find_cost(around, twist, twist, ahead) > INADMISSIBLE
         least = math.inf
         for k in range(len(candidates)):
             far = False
@@ -67,7 +67,7 @@ def choose_twists(
             # If braking takes time, the cost starts from the current twist, so every
             # twist is allowed.
             cost += 1e6 if far and not brakes else 0.0
-            cost += 1e6 if late and moves else 0.0
+            cost += 1e6 if must_stop and moves else 0.0
             if cost < least:
                 out[n] = k
                 least = cost

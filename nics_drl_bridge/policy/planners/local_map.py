@@ -43,21 +43,11 @@ def fill_outline(robot: RobotSpec) -> FootprintDiscs:
         radius = robot.footprint_radius
         return FootprintDiscs(np.zeros((0, 3)), np.zeros(2), radius, radius)
     corners = np.array(robot.footprint)
-    low = corners.min(axis=0)
-    high = corners.max(axis=0)
-    spacing = max(FINE_M, math.sqrt(float(np.prod(high - low)) / MOST_POINTS))
-    axes = (
-        np.arange(a + spacing / 2, b, spacing) for a, b in zip(low, high, strict=True)
-    )
-    lattice = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    lattice = _make_lattice(corners)
     depth = compute_depths(lattice, corners)
     lattice = lattice[depth > 0.0]
     depth = depth[depth > 0.0]
-    chosen = _cover(lattice, depth)
-    sides = np.roll(corners, -1, axis=0) - corners
-    for corner, side in zip(corners, sides, strict=True):
-        count = max(1, round(float(np.linalg.norm(side)) / BORDER_M))
-        chosen += [np.array([*(corner + side * k / count), 0.0]) for k in range(count)]
+    chosen = [*_cover(lattice, depth), *_list_border(corners)]
     reach = np.linalg.norm(lattice[:, None] - corners, axis=-1).max(axis=1)
     middle = int(reach.argmin())
     return FootprintDiscs(
@@ -90,6 +80,27 @@ def _count_covered(centres: Array, radii: Array, points: Array) -> Integers:
         x, y = (points[first : first + ROWS, None] - centres).transpose(2, 0, 1)
         count += (np.sqrt(x * x + y * y) < radii).sum(axis=0)
     return count
+
+
+def _make_lattice(corners: Array) -> Array:
+    """Returns points (L, 2) in the box around an outline."""
+    low = corners.min(axis=0)
+    high = corners.max(axis=0)
+    spacing = max(FINE_M, math.sqrt(float(np.prod(high - low)) / MOST_POINTS))
+    axes = (
+        np.arange(a + spacing / 2, b, spacing) for a, b in zip(low, high, strict=True)
+    )
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+
+
+def _list_border(corners: Array) -> list[Array]:
+    """Returns discs (3,) without radius along an outline."""
+    discs = []
+    sides = np.roll(corners, -1, axis=0) - corners
+    for corner, side in zip(corners, sides, strict=True):
+        count = max(1, round(float(np.linalg.norm(side)) / BORDER_M))
+        discs += [np.array([*(corner + side * k / count), 0.0]) for k in range(count)]
+    return discs
 
 
 def make_situation(

@@ -99,8 +99,8 @@ def train(
         env.seed(int(rng.integers(SEEDS)))
     else:
         check_same(content["about"], about, path)
-        size = int(np.prod(env.observation_space.shape))
-        training = engine(settings, env, seed, (np.zeros(size), np.ones(size)))
+        nothing = np.zeros(env.observation_space.shape).ravel()
+        training = engine(settings, env, seed, (nothing, nothing + 1.0))
         _restore(content, (training, stop), env, path)
     busy = env.stepping_s
 
@@ -118,8 +118,12 @@ def train(
             raise
         save()
         logger.close()
-    taken = time.perf_counter() - begin
-    return Trained(training.policy, training.steps, taken, env.stepping_s - busy)
+    return Trained(
+        training.policy,
+        training.steps,
+        wall_s=time.perf_counter() - begin,
+        stepping_s=env.stepping_s - busy,
+    )
 
 
 def refuse_diverged(training: LeanPpo | Sb3Training, bound: float = math.inf) -> None:
@@ -255,6 +259,13 @@ class SeedResult:
     trained: Trained
     summaries: dict[str, Summary]
 
+    def plain(self) -> dict[str, Any]:
+        """Returns the steps of the training and the summaries as plain data."""
+        plain: dict[str, Any] = {"training_steps": self.trained.steps}
+        for world, summary in self.summaries.items():
+            plain[world] = dataclasses.asdict(summary)
+        return plain
+
 
 @dataclass(frozen=True)
 class TrainOrder:
@@ -285,20 +296,13 @@ def run(
     _check(order.settings, order.seeds, order.out, order.resumed)
     settings = order.settings
     model, worlds = opened or open_training(settings)
-    trial = _make_env(model, worlds[next(iter(settings.worlds))], settings, TRIED)
-    algorithms.check_serves(settings, trial)
-    trial.reset(seed=FIRST_SEED)
-    # Refuse a task that returns non-finite numbers before creating a folder.
-    for _ in range(TRIED):
-        trial.step(trial.action_space.sample())
-    del trial
+    _try_task(model, worlds, settings)
     results = []
     with _lock_folder(order.out):
         write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
         for seed in order.seeds:
             folder = order.out / f"seed_{seed}"
-            begun = (folder / CHECKPOINT).is_file()
-            resumed = order.resumed and begun
+            resumed = order.resumed and (folder / CHECKPOINT).is_file()
             trained = learn(model, worlds, settings, seed, folder, tell, resumed)
             summaries = {}
             for name in settings.worlds:
@@ -308,12 +312,7 @@ def run(
                 )
                 summaries[name] = summarise(driven, model.control_period)
             result = SeedResult(seed, trained, summaries)
-            plain: dict[str, Any] = {"training_steps": trained.steps}
-            plain |= {
-                world: dataclasses.asdict(summary)
-                for world, summary in summaries.items()
-            }
-            write_text(folder / EVALUATION, format_json(plain, 2) + "\n")
+            write_text(folder / EVALUATION, format_json(result.plain(), 2) + "\n")
             export(model, settings, result, order.command, folder / POLICY)
             done(result)
             results.append(result)
@@ -339,6 +338,17 @@ def _lock_folder(out: Path) -> Iterator[None]:
             f"{out}: another training is running there; wait until it ends, "
             "or choose another --out."
         ) from None
+
+
+def _try_task(
+    model: SimulatorModel, worlds: Worlds, settings: TrainingSettings
+) -> None:
+    """Refuses a task that does not serve or gives no finite numbers, before a folder is made."""
+    env = _make_env(model, worlds[next(iter(settings.worlds))], settings, TRIED)
+    algorithms.check_serves(settings, env)
+    env.reset(seed=FIRST_SEED)
+    for _ in range(TRIED):
+        env.step(env.action_space.sample())
 
 
 def export(

@@ -337,12 +337,11 @@ def fit_settings(settings: TrainingSettings, opened: Opened, inherited: bool) ->
     pace = find_pace(opened.model, worlds, options.get("top_speed"))
     changed: dict[str, Any] = {}
     if inherited and options.get("scan") == "around" and not covers(lidar, "around"):
-        scan = options["scan"] = (
-            "front" if covers(lidar, "front") else count_sectors(lidar)
-        )
-        far = LAYOUTS["around"].range_max
+        front = covers(lidar, "front")
+        options["scan"] = "front" if front else count_sectors(lidar)
         notes.append(
-            f"the lidar {lidar.name!r} does not cover {far:g} m all around: scan: {scan}"
+            f"the lidar {lidar.name!r} does not cover {LAYOUTS['around'].range_max:g} m "
+            f"all around: scan: {options['scan']}"
         )
     if (
         "max_episode_steps" not in settings.model_fields_set
@@ -354,19 +353,31 @@ def fit_settings(settings: TrainingSettings, opened: Opened, inherited: bool) ->
             f"{pace.far:g} m at {pace.speed:g} m/s"
         )
         if inherited and pace.steps > defaults.EPISODE_STEPS:
-            # Episodes are longer than the other robot's by this factor.
             factor = pace.steps / defaults.EPISODE_STEPS
-            reward = options.get("time_reward")
-            if reward:
-                options["time_reward"] = round(reward / factor, 6)
-                notes.append(f"time_reward {options['time_reward']:g}, was {reward:g}")
-            name = settings.algorithm
-            learner = settings.ppo if name == "ppo" else settings.sac
-            discount = round(1.0 - (1.0 - learner.discount) / factor, 6)
-            notes.append(f"{name}.discount {discount:g}, was {learner.discount:g}")
-            changed[name] = learner.model_copy(update={"discount": discount})
+            changed |= _stretch(settings, options, factor, notes)
     made = settings.model_copy(update={**changed, "task_options": options})
     short = pace.shortfall(made.max_episode_steps)
     if short is not None:
         notes.append(short)
     return Fitted(made, tuple(notes), opened)
+
+
+def _stretch(
+    settings: TrainingSettings,
+    options: dict[str, Any],
+    factor: float,
+    notes: list[str],
+) -> dict[str, PpoSettings | SacSettings]:
+    """Adapts time reward and discount to episodes that are longer by a factor.
+
+    Changes the options and adds to the notes; returns the changed settings of the algorithm.
+    """
+    reward = options.get("time_reward")
+    if reward:
+        options["time_reward"] = round(reward / factor, 6)
+        notes.append(f"time_reward {options['time_reward']:g}, was {reward:g}")
+    name = settings.algorithm
+    learner = settings.ppo if name == "ppo" else settings.sac
+    discount = round(1.0 - (1.0 - learner.discount) / factor, 6)
+    notes.append(f"{name}.discount {discount:g}, was {learner.discount:g}")
+    return {name: learner.model_copy(update={"discount": discount})}

@@ -78,25 +78,25 @@ class TrainVecEnv(VecEnv):
     ) -> tuple[Observation, Singles, Mask, list[Any]]:
         """Advances every world by one control period; see Stable-Baselines3."""
         begin = time.perf_counter()
-        for n in self._ended:  # new dicts, because an algorithm may keep the old ones
-            self._infos[n] = {}
-        self._ended = []
+        self._clear_infos()
         parts = []
         for env, rows in zip(self.envs, self._rows, strict=True):
-            observation, reward, terminated, truncated, info = env.step(
-                self._actions[rows]
-            )
+            *seen, terminated, truncated, info = env.step(self._actions[rows])
             ended = terminated | truncated
-            parts.append((observation, reward, ended))
+            parts.append((*seen, ended))
             if ended.any():
                 self._fill_infos(rows.start, ended, truncated & ~terminated, info)
-        observations, rewards, dones = (
-            _join_rows(list(rows_of_envs)) for rows_of_envs in zip(*parts, strict=True)
-        )
+        observations, rewards, dones = map(_join_rows, zip(*parts, strict=True))
         self.stepping_s += time.perf_counter() - begin
         if self.on_step is not None:
             self.on_step()
         return observations, rewards.astype(np.float32), dones, list(self._infos)
+
+    def _clear_infos(self) -> None:
+        """Puts new dicts in place of those of ended worlds, which an algorithm may keep."""
+        for n in self._ended:
+            self._infos[n] = {}
+        self._ended = []
 
     def _fill_infos(
         self, first: int, ended: Mask, truncated: Mask, info: dict[str, Any]
@@ -161,6 +161,6 @@ class TrainVecEnv(VecEnv):
             env.close()
 
 
-def _join_rows(parts: list[AnyArray]) -> AnyArray:
+def _join_rows(parts: Sequence[AnyArray]) -> AnyArray:
     """Concatenates the rows of several envs; a single env's rows are returned unchanged."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
