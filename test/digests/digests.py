@@ -142,6 +142,13 @@ def identified() -> Found:
             "noise": (0.001, 0.002),
             "seed": 2,
         },
+        "bursts": {
+            "burst": 0.1,
+            "pose_clock_ahead": 3.0,
+            "noise": (0.001, 0.002),
+            "seed": 3,
+        },
+        "poses only": {"measured_state": False, "latency": 0.05, "seed": 4},
     }.items():
         for robot in ROBOTS:
             spec = load_robot(robot)
@@ -224,7 +231,9 @@ DIGESTS: dict[str, Callable[[], Found]] = {
         estimates,
     )
 }
-SEARCHED = [f"ackermann {name}" for name in ("late and noisy", "turned")]
+SEARCHED = [
+    f"ackermann {name}" for name in ("late and noisy", "turned", "bursts", "poses only")
+]
 TOLERANCES = {
     "motion_state_errors": 0.05,
     "training": 1e-5,

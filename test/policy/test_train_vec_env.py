@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+import warnings
+
 import gymnasium
 import numpy as np
 import pytest
 from robots import direct_model, field
+from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from nics_drl_bridge.env.registry import ENVIRONMENTS
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
@@ -21,6 +25,19 @@ def vector(count=4, **arguments):
         max_episode_steps=LIMIT,
         **{"autoreset_mode": "SameStep"} | arguments,
     )
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+@pytest.mark.parametrize("actions", ["continuous", "discrete"])
+def test_stable_baselines3s_checker_finds_nothing_to_warn_of(name, actions):
+    options = {"actions": actions}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make(
+            name, model=direct_model(), world=field(), task_options=options
+        )
+        check_env(env)
+        check_env(env.unwrapped)
 
 
 def test_it_feeds_what_a_vec_env_of_single_envs_feeds():
