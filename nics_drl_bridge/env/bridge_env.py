@@ -280,8 +280,14 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         if before is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         self._steps += 1
-        if self._direct is not None:
-            return self._advance_directly(self._direct, action)
+        direct = self._direct
+        if direct is not None:
+            if not direct.try_action(action):
+                direct.commands[...] = self._make_commands(action)
+            self._commands = direct.commands
+            observation, terms, ended, info = direct.advance(self.memory)
+            self.ended[0] = ended
+            return observation, terms, info
         self._commands = self._make_commands(action)
         measured, facts = self._backend.step(self._commands[self._row])
         self._facts = facts
@@ -300,16 +306,6 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             row = values[self._row]
             facts[name] = row.copy() if row.ndim else row.item()
         return out.reshape(-1), terms, self._make_info(view, facts)
-
-    def _advance_directly(
-        self, direct: DirectSteps, action: AnyArray
-    ) -> tuple[Singles, dict[str, Any], Info]:
-        if not direct.try_action(action):
-            direct.commands[...] = self._make_commands(action)
-        self._commands = direct.commands
-        observation, terms, ended, info = direct.advance(self.memory)
-        self.ended[0] = ended
-        return observation, terms, info
 
     def _make_commands(self, action: AnyArray) -> Array:
         given = guard.check_action(action, self.action_space, "action")

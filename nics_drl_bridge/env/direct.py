@@ -36,21 +36,24 @@ def bind_steps(backend: Backend, task: Task) -> DirectSteps | None:
     data = backend.simulator.data
     pose = view.pose[0, 0]
     true_pose = data.pose[0, 0]
+    collided = data.collided[0]
     commands = np.zeros((1, 1, len(task.robot.command)))
     move = backend.simulator.bind_step(commands)
 
     def advance(memory: Memory) -> Any:
         before[0, 0] = pose
         move()
-        *judged, facts = judge(memory)
-        info: Info = {name: memory[name][0, 0].copy() for name in task.shown}
+        observation, terms, ended, judged = judge(memory)
+        info: Info = {}
+        for name in task.shown:
+            info[name] = memory[name][0, 0].copy()
         info["pose"] = pose.copy()
         info["scan_age_s"] = 0.0
         info["odom_age_s"] = 0.0
         info["stamp_ns"] = backend.now_ns
         info["true_pose"] = true_pose.copy()
-        info["true_collision"] = bool(data.collided.item())
-        return *judged, info | facts
+        info["true_collision"] = bool(collided)
+        return observation, terms, ended, info | judged
 
     return DirectSteps(view, commands, _bind_actions(task, commands), advance)
 
