@@ -124,6 +124,18 @@ CAMPAIGNS: dict[str, Campaign] = {
         },
         FILES,
     ),
+    "fast_robots": Campaign(
+        "--steps 5 --robots 2000",
+        {
+            "fat": Control(
+                "the touch: the robots are measured 2 mm larger", "overlap_mm"
+            ),
+            "no_walls": Control(
+                "the walls between the rooms, for the simulator", "passed_a_wall"
+            ),
+        },
+        quick=True,
+    ),
     "gate_envelope": Campaign(
         "--steps 3000",
         {
