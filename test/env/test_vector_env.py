@@ -208,6 +208,19 @@ def test_gymnasiums_checks_of_an_env_find_nothing_to_warn_of_in_a_vector(
         env.close()
 
 
+def test_gymnasiums_wrappers_take_it():
+    env = gymnasium.make_vec(NAVIGATION, 2, model=model(), world=field(count=2))
+    env = gymnasium.wrappers.vector.RecordEpisodeStatistics(env)
+    env.reset(seed=0)
+    lengths = []
+    for action in actions_of(env, 400):
+        info = env.step(action)[4]
+        if "episode" in info:
+            lengths += info["episode"]["l"][info["_episode"]].tolist()
+    assert lengths
+    assert min(lengths) >= 1
+
+
 class Fragile(Navigation):
     """Raises in one world of the batch, after the simulator has moved all."""
 
