@@ -22,7 +22,7 @@ from nics_drl_bridge.identify.repair import (
     check_units,
     repair_rows,
 )
-from nics_drl_bridge.identify.verdict import Gap, Mistake
+from nics_drl_bridge.identify.verdict import Doubt, Gap, Mistake
 from nics_drl_bridge.recording.recording import (
     Recording,
     Samples,
@@ -268,6 +268,17 @@ def test_a_speed_that_another_unit_explains_is_told(differential, column, unit, 
     (note,) = check_commands(Drive(other, differential))
     assert f"if they are in {unit}, write `unit: {unit}`" in note
     assert isinstance(note, Mistake)
+
+
+def test_a_robot_that_skids_is_told_from_a_wrong_scale(differential):
+    lengths = {"track": 0.5, "effective_track": 1.25, "wheel_radius": 0.1}
+    kind = {"kind": "skid_steer", "footprint_radius": 0.4, "parameters": lengths}
+    skidding = drive(build_robot(kind), measured_state=False)
+    (note,) = check_commands(Drive(skidding, build_robot(kind)))
+    assert "turns 0.4 times as fast" in note
+    assert "`effective_track: 1.2" in note
+    (doubt,) = check_commands(Drive(skidding, differential))
+    assert isinstance(doubt, Doubt)
 
 
 def test_wheels_in_rpm_are_told_if_their_radius_is_known():
