@@ -333,10 +333,12 @@ def fit_base(evidence: forms.Evidence, clear: tuple[InputCurve, ...]) -> Base:
             best = plain
             trial = plain_trial
     # Each change builds on those that were kept before it, so their order matters.
+    tried = [best.draft.form]  # since the last that was kept
     for name, change, worth in list_changes(evidence):
         form = change(best.draft.form)
-        if form == best.draft.form:
+        if form in tried:
             continue
+        tried.append(form)
         changed = fit_form(evidence, form, best)
         changed_trial = cross_validate_base(changed)
         is_better = changed_trial.level < worth * trial.level
@@ -345,6 +347,7 @@ def fit_base(evidence: forms.Evidence, clear: tuple[InputCurve, ...]) -> Base:
         if is_better:
             best = changed
             trial = changed_trial
+            tried = [form]
     return replace(best, candidates=tuple(candidates))
 
 

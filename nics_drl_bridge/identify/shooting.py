@@ -16,6 +16,7 @@ from nics_drl_bridge.identify.kernels import Shot, make_used_terms, shoot, tange
 from nics_drl_bridge.identify.open_loop import put_states
 from nics_drl_bridge.identify.statistics import (
     estimate_clustered_covariance,
+    estimate_clustered_errors,
     minimise_robustly,
 )
 from nics_drl_bridge.recording.recording import Samples
@@ -422,7 +423,8 @@ class _Search:
         covariance = np.full((size, size), np.nan)
         covariance[np.ix_(self.sought, self.sought)] = joint[: self.count, : self.count]
         errors = np.full(self.free.shape, np.nan)
-        variances = np.diag(joint)[self.count :]
-        errors[self.free] = np.sqrt(np.maximum(variances, 0.0))
+        # Without the pull, which would make them seem more certain than the drive does.
+        alone = estimate_clustered_errors(slopes[:, self.count :], rest, span)
+        errors[self.free] = alone * self.unit
         names = self.parameters.names
         return Predictive(best, names, values, rest, covariance, errors)
