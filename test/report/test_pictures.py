@@ -165,8 +165,8 @@ def test_a_curve_shows_a_training_from_its_first_report_on():
 
 
 def test_a_drive_is_drawn():
-    x = np.linspace(0.0, 1.0, 21)
+    x = np.linspace(0.0, 1.4, 21)
     pose = np.stack([x, x**2, x], axis=1)
     pattern = Pattern(0.1, np.zeros((20, 3)), pose, bound=2.0, footprint=0.2)
     png = drive_picture(pattern, load_robot("mecanum"))
-    assert len(pixels_of(decoded(png), MEASURED)) > 50
+    assert len(pixels_of(decoded(png), MEASURED)) > 100
