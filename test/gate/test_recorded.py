@@ -102,7 +102,7 @@ def test_a_fault_stops_the_robot_in_time_and_for_good_if_it_latches(fault):
     assert rule in {line.split(":")[0].split()[-1] for line in drive.lines}
     assert not drive.decisions[-1].twist.any()
     drive.fault = "stopped"
-    drive.run(32)  # it stands for as long as by default
+    drive.run(32)
     assert drive.state.armed == (rule in PASSING)
     latched = drive.state.latched
     assert ("" if latched is None else latched.rule) == (
