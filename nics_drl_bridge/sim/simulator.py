@@ -510,17 +510,21 @@ class FastSimulator:
         motions = self.sampler.motions
         crowded = self._sizes.crowded
         grids = _share_equal_maps([world.grid for world in members])
-        moves = any(map(any, motions))
+        distances, places = joined([map_field(grid).distances for grid in grids])
+        moves = any(motion is not None for group in motions for motion in group)
+        standing = not (crowded or moves) and self.sampler.count >= STANDING
+        plans, waypoints = _stack_plans(motions if moves else [() for _ in members])
+        walls = [world.all_walls() for world in members]
         return WorldSetArrays(
-            stack_fixtures(
-                [world.all_walls() for world in members], grids, self.data.member
-            ),
-            *joined([map_field(grid).distances for grid in grids]),
+            stack_fixtures(walls, grids, self.data.member),
+            distances,
+            places,
             self._scanner.table.outlines.arguments,
             crowded,
-            not (crowded or moves) and self.sampler.count >= STANDING,
+            standing,
             moves,
-            *_stack_plans(motions if moves else [()] * len(members)),
+            plans,
+            waypoints,
             np.array([world.extent for world in members]),
         )
 
