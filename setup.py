@@ -40,16 +40,16 @@ EXTRAS = {
         f"dartpy>=6.20; {ROS_WHEELS_EXIST}"
     ],  # it has wheels for this platform only
     "multi": ["pettingzoo>=1.25,<1.28"],
-    # Before 2.6, torch.load unpickles whatever a file says unless told not to, and its reader of
-    # weights alone could be made to run code (CVE-2025-32434). Of its releases for Linux only some
-    # are small, as 2.13 is: no CUDA packages.
     "train": [
-        "filelock>=3.12",  # PyTorch needs it, too
+        "filelock>=3.12",
         "onnx>=1.16",
         "onnxruntime>=1.18",  # a policy file is checked by it as it is written
+        "tensorboard>=2.16",
+    ],
+    # Of torch's releases for Linux only some are small, as 2.13 is: no CUDA packages.
+    "sb3": [
         "onnxscript>=0.1",
         "stable-baselines3>=2.7,<2.10",
-        "tensorboard>=2.16",
         "torch>=2.6,<2.14",
     ],
     # RLlib holds Gymnasium at a version of its own: for an environment apart, as `nox -s ray`
@@ -97,7 +97,17 @@ EXTRAS = {
 # All that a user may want. ROS 2 comes from a ROS 2 installation, or from `ros` beside this.
 EXTRAS["all"] = [
     one
-    for name in ("bags", "dart", "deploy", "mujoco", "multi", "train", "video", "view")
+    for name in (
+        "bags",
+        "dart",
+        "deploy",
+        "mujoco",
+        "multi",
+        "sb3",
+        "train",
+        "video",
+        "view",
+    )
     for one in EXTRAS[name]
 ]
 # What `make setup` installs: where a ROS 2 is sourced, and where none is.

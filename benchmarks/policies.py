@@ -102,7 +102,6 @@ def shorten(settings: TrainingSettings) -> TrainingSettings:
 
 def learn(settings: TrainingSettings, seed: int, episodes: int) -> Result:
     """Trains with one seed and drives unseen episodes; returns the figures."""
-    from nics_drl_bridge.policy.train.algorithms import make_act
     from nics_drl_bridge.policy.train.run import train
 
     model, worlds = open_training(settings)
@@ -117,8 +116,7 @@ def learn(settings: TrainingSettings, seed: int, episodes: int) -> Result:
         settings.task_options,
         settings.max_episode_steps,
     )
-    act = make_act(trained.algorithm)
-    outcomes = drive_worlds(env, act, range(FIRST_SEED, FIRST_SEED + episodes))
+    outcomes = drive_worlds(env, trained.act, range(FIRST_SEED, FIRST_SEED + episodes))
     wall_s = time.perf_counter() - begin
     told = summarise(outcomes, model.control_period)
     return {

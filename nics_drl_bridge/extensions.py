@@ -41,17 +41,17 @@ INSTALL = {
     "mujoco": "mujoco",
     "onnx": "deploy",
     "onnxruntime": "deploy",
-    "onnxscript": "train",
+    "onnxscript": "sb3",
     "pettingzoo": "multi",
-    "ray": "train,distributed",
+    "ray": "sb3,train,distributed",
     "rosbags": "bags",
     "safetensors": "deploy",
-    "stable_baselines3": "train",
+    "stable_baselines3": "sb3",
     "tensorboard": "train",
-    "torch": "train",
+    "torch": "sb3",
     "websockets": "view",
 }
-TRAINING = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
+TRAINING = ("filelock", "tensorboard", "onnx", "onnxruntime")
 
 
 @cache

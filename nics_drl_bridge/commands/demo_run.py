@@ -190,7 +190,7 @@ class Demo:
         return fit_settings(chosen.model_copy(update=changes), opened, inherited=True)
 
     def _train(self, model: SimulatorModel) -> Learned:
-        from nics_drl_bridge.policy.train.run import (  # needs torch
+        from nics_drl_bridge.policy.train.run import (
             SeedResult,
             export,
             train,

@@ -1,4 +1,4 @@
-"""Checks of a command's names and files, before PyTorch or ROS 2 is loaded."""
+"""Checks of a command's names and files, before anything slow is loaded."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -20,6 +20,7 @@ EXTRAS = {  # extra -> purpose, modules that it installs
     "bags": ("reading and writing rosbags", ("rosbags", "mcap")),
     "deploy": ("driving by policy files", ("onnx", "onnxruntime")),
     "train": ("training", TRAINING),
+    "sb3": ("training with Stable-Baselines3", ("torch", "stable_baselines3")),
     "multi": ("teams, as PettingZoo environments", ("pettingzoo",)),
     "view": ("the page of nics watch", ("websockets",)),
     "video": ("MP4 files of nics watch", ("imageio_ffmpeg",)),

@@ -112,8 +112,7 @@ def train(
     if (settings or algorithm) and not resume:
         check_settings(task, settings, named)
     extensions.require("training", *extensions.TRAINING)
-    with console.show_progress("loading PyTorch"):
-        from nics_drl_bridge.policy.train import run as train_run
+    from nics_drl_bridge.policy.train import run as train_run
 
     task_of_user = task if ":" in task else None
     opened = None
@@ -246,14 +245,14 @@ def _run_watched(
 
         views: list[TrainingView] = []  # one per seed started so far
 
-        def on_env(env: Any) -> None:
-            views.append(TrainingView(server, env))
-            env.on_step = views[-1]
+        def on_worlds(worlds: Any) -> None:
+            views.append(TrainingView(server, worlds))
+            worlds.on_step = views[-1]
 
         def note(what: str) -> None:
             views[-1].note = what
 
-        _run(run, order, partial(learn, on_env=on_env), as_json, note)
+        _run(run, order, partial(learn, on_worlds=on_worlds), as_json, note)
 
 
 def _run(

@@ -12,7 +12,7 @@ PERIOD_S = 0.1  # between two frames [s]
 
 
 class Envs(Protocol):
-    """Vector envs that are stepped together, like `TrainVecEnv`."""
+    """Vector envs that are stepped together, like `TrainingWorlds`."""
 
     envs: tuple[BridgeVectorEnv, ...]
 

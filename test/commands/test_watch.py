@@ -84,7 +84,7 @@ def test_a_watched_training_shows_each_env_and_what_it_does(monkeypatch):
     monkeypatch.setattr("nics_drl_bridge.watch.show.open_page", lambda url: None)
     monkeypatch.setattr(train, "_run", run)
     env = SimpleNamespace()
-    train._run_watched(None, None, lambda on_env: on_env(env), False)
+    train._run_watched(None, None, lambda on_worlds: on_worlds(env), False)
     assert env.on_step is views[0]
     assert views[0].env is env
     assert views[0].note == "half of it"

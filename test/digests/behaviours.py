@@ -74,8 +74,9 @@ def training() -> Found:
     with tempfile.TemporaryDirectory() as folder:
         actor = train(*open_training(settings), settings, 5, Path(folder)).algorithm
     return {
-        name: joined([weights.detach().numpy()])
-        for name, weights in actor.named_parameters()
+        f"layers.{k}.{name}": joined([weights])
+        for k, layer in enumerate(actor.network.layers)
+        for name, weights in layer._asdict().items()
     }
 
 

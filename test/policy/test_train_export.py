@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -9,8 +10,10 @@ from stable_baselines3 import PPO, SAC
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import ConfigError, PolicyError
-from nics_drl_bridge.policy.train.algorithms import Actor, make_act
 from nics_drl_bridge.policy.train.export import export_policy
+from nics_drl_bridge.policy.train.networks import Actor, Network, count_weights
+from nics_drl_bridge.policy.train.normaliser import Normaliser
+from nics_drl_bridge.policy.train.torch_networks import TorchActor
 from policy.policy_rig import (
     SECTORS,
     export,
@@ -45,12 +48,22 @@ def make_algorithm(name, env):
     else:
         size = env.observation_space.shape[0]
         scale = np.linspace(-1.0, 1.0, size), np.linspace(0.1, 2.0, size)
+        if name == "lean":
+            return make_actor(env, scale)
         torch.manual_seed(0)
-        made = Actor(env.observation_space, env.action_space, [16, 8], scale)
+        made = TorchActor(env.observation_space, env.action_space, [16, 8], scale)
         last = made.layers[-1]
     with torch.no_grad():
         last.weight.mul_(500.0)
     return made
+
+
+def make_actor(env, scale):
+    widths = (len(scale[0]), 16, 8, gymnasium.spaces.flatdim(env.action_space))
+    rng = np.random.default_rng(0)
+    weights = rng.normal(0.0, 0.5, count_weights(widths)).astype(np.float32)
+    normaliser = Normaliser.of(env.observation_space, *scale)
+    return Actor(normaliser, Network(weights, widths), env.task.actions == "discrete")
 
 
 @pytest.mark.slow
@@ -60,6 +73,8 @@ def make_algorithm(name, env):
         ("continuous", "ppo"),
         ("discrete", "ppo"),
         ("continuous", "sac"),
+        ("continuous", "torch"),
+        ("discrete", "torch"),
         ("continuous", "lean"),
         ("discrete", "lean"),
     ],
@@ -69,15 +84,17 @@ def test_the_file_of_an_algorithm_acts_as_it_predicts(env, tmp_path, name):
     algorithm = make_algorithm(name, env)
     policy = export_policy(algorithm, env.task, env.model, tmp_path / "policy.onnx")
     rows = observations(env).astype(np.float32)
-    if name == "lean":
-        wanted = make_act(algorithm)(rows)
+    if name in ("lean", "torch"):
+        wanted = algorithm.act(rows)
     else:
         wanted, _ = algorithm.predict(rows, deterministic=True)
     if env.task.actions == "continuous":
         wanted = np.clip(wanted, -1.0, 1.0)
     assert policy.act(rows) == pytest.approx(wanted, abs=1e-5)
     assert policy.command(rows) == pytest.approx(env.task.command(wanted), abs=1e-5)
-    assert len(np.unique(np.round(policy.act(rows), 2))) > 1 + (name != "lean")
+    assert len(np.unique(np.round(policy.act(rows), 2))) > 1 + (
+        name not in ("lean", "torch")
+    )
 
 
 def test_the_normaliser_is_inside_the_graph(tmp_path):

@@ -189,7 +189,7 @@ def test_a_training_that_diverges_says_so_and_leaves_no_broken_checkpoint(
         "its weights are too large or not finite; lower its learning_rate."
         in done.output
     )
-    assert not list(out.rglob("checkpoint.pt"))
+    assert not list(out.rglob("checkpoint.npz"))
     assert not (out / "settings.yaml").exists()  # which would bar the corrected ones
 
 
@@ -212,7 +212,7 @@ def test_where_ray_is_missing_one_sentence_says_what_to_install(tmp_path):
     assert done.exit_code == 2
     words = " ".join(done.output.split())
     assert "engine 'ray' needs the module 'ray'" in words
-    assert "pip install 'nics_drl_bridge[train,distributed]'" in words
+    assert "pip install 'nics_drl_bridge[sb3,train,distributed]'" in words
 
 
 @pytest.mark.process
@@ -236,7 +236,7 @@ def test_an_interrupted_training_tells_the_command_that_resumes_it(tmp_path):
         text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as process:
-        checkpoint = tmp_path / "my run" / "seed_3" / "checkpoint.pt"
+        checkpoint = tmp_path / "my run" / "seed_3" / "checkpoint.npz"
         wait_for(lambda: checkpoint.is_file() or process.poll() is not None, 300.0)
         process.send_signal(signal.SIGINT)
         said = process.communicate(timeout=60.0)[1]

@@ -86,16 +86,3 @@ def test_pictures_of_all_worlds_are_tiled():
     picture = TrainVecEnv(vector(render_mode="rgb_array"))
     picture.reset()
     assert picture.render().shape == (1000, 1000, 3)
-
-
-def test_who_watches_is_called_after_each_step_of_all_worlds():
-    env = TrainVecEnv(vector(2), vector(3))
-    seen = []
-    env.on_step = lambda: seen.append(
-        [one.simulator.data.steps.max() for one in env.envs]
-    )
-    env.seed(0)
-    env.reset()
-    for _ in range(2):
-        env.step(np.zeros((5, 3), np.float32))
-    assert seen == [[1, 1], [2, 2]]

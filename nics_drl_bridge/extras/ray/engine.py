@@ -2,7 +2,6 @@
 
 import copy
 import functools
-import json
 import logging
 import os
 import socket
@@ -29,17 +28,27 @@ from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
-from stable_baselines3.common.logger import configure
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
-from nics_drl_bridge.policy.train import algorithms
 from nics_drl_bridge.policy.train import run as train
 from nics_drl_bridge.policy.train.checkpoint import read_checkpoint, write_content
-from nics_drl_bridge.policy.train.progress import RECENT, Progress, Tell
-from nics_drl_bridge.policy.train.settings import TrainingSettings
-from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
+from nics_drl_bridge.policy.train.normaliser import observe_statistics
+from nics_drl_bridge.policy.train.progress import RECENT, Progress, Tell, TrainingLog
+from nics_drl_bridge.policy.train.settings import (
+    LEAST_RATE,
+    TrainingSettings,
+    check_serves,
+)
+from nics_drl_bridge.policy.train.torch_networks import (
+    TorchActor,
+    make_layers,
+    to_tensors,
+)
+from nics_drl_bridge.policy.train.worlds import COLLISION as TOLD_COLLISION
+from nics_drl_bridge.policy.train.worlds import SUCCESS as TOLD_SUCCESS
+from nics_drl_bridge.policy.train.worlds import TrainingWorlds
 
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
 # loss parameters, as in Stable-Baselines3
@@ -106,7 +115,7 @@ class WorldsRunner(SingleAgentEnvRunner):
         torch.set_num_threads(chosen["threads"])
         # Copy, because arrays shared by Ray are read-only and would need kernels of their own.
         make = copy.deepcopy(ray.get(chosen["make"]))
-        self.env: TrainVecEnv = make(self.worker_index - 1, self.num_workers)
+        self.env: TrainingWorlds = make(self.worker_index - 1, self.num_workers)
         self.num_envs = self.env.num_envs
         rng = np.random.default_rng([*chosen["seed"], self.worker_index])
         self.env.seed(int(rng.integers(train.SEEDS)))
@@ -151,21 +160,24 @@ class WorldsRunner(SingleAgentEnvRunner):
         bounded = actions
         if isinstance(space, gymnasium.spaces.Box):
             bounded = np.clip(actions, space.low, space.high)
-        self._last, rewards, done, infos = self.env.step(bounded)
-        final = {}
-        for n in np.flatnonzero(done):
-            info = infos[n]
-            for name, metric in (("is_success", SUCCESS), ("collision", COLLISION)):
-                self.metrics.log_value(metric, int(info.get(name, False)), reduce="sum")
-            final[t, int(n)] = info["terminal_observation"], info["TimeLimit.truncated"]
-        return observations, actions, logits.numpy(), logp, rewards, final
+        step = self.env.step(bounded)
+        self._last = step.observations
+        endings = step.endings
+        for name, metric in ((TOLD_SUCCESS, SUCCESS), (TOLD_COLLISION, COLLISION)):
+            count = int(endings.told(name).sum())
+            self.metrics.log_value(metric, count, reduce="sum")
+        final = {
+            (t, int(n)): (endings.observations[k], bool(endings.truncated[k]))
+            for k, n in enumerate(endings.worlds)
+        }
+        return observations, actions, logits.numpy(), logp, step.rewards, final
 
 
 Batch = dict[str, Any]
 
 
 class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
-    """`Actor` and a similar critic; `model_config` has `hidden`, `normaliser` and `log_std`."""
+    """Actor and a similar critic; `model_config` has `hidden`, `normaliser` and `log_std`."""
 
     def setup(self) -> None:
         """Builds the layers."""
@@ -173,8 +185,8 @@ class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         space = self.observation_space
         hidden = list(chosen["hidden"])
         normaliser = chosen["normaliser"]
-        self.actor = algorithms.Actor(space, self.action_space, hidden, normaliser)
-        self.critic = algorithms.make_layers([int(space.shape[0]), *hidden, 1], 1.0)
+        self.actor = TorchActor(space, self.action_space, hidden, normaliser)
+        self.critic = make_layers([int(space.shape[0]), *hidden, 1], 1.0)
         if not self.actor.discrete:
             log_std = torch.full(self.action_space.shape, float(chosen["log_std"]))
             self.log_std = torch.nn.Parameter(log_std)
@@ -292,7 +304,11 @@ def train_on_ray(
     finally:
         algorithm.stop()
     return train.Trained(
-        actor, learning.steps, time.perf_counter() - begin, learning.stepping_s
+        actor,
+        actor.act,
+        learning.steps,
+        time.perf_counter() - begin,
+        learning.stepping_s,
     )
 
 
@@ -324,7 +340,7 @@ class Learning:
 
     def run(self, tell: Tell, about: dict[str, Any]) -> None:
         """Learns until all steps are done; saves checkpoints."""
-        logger = configure(str(self.path.parent), ["tensorboard"])
+        log = TrainingLog(self.path.parent)
         begin = heard = time.perf_counter()
         first = saved = self.steps
         every = self.settings.checkpoint_every
@@ -339,13 +355,13 @@ class Learning:
             progress = self._progress(first, now - begin)
             tell(progress)
             for name in ("success", "collision", "steps_per_s", "env_share"):
-                logger.record(f"rollout/{name}", getattr(progress, name))
-            logger.dump(self.steps)
+                log.record(f"rollout/{name}", getattr(progress, name))
+            log.dump(self.steps)
             if self.steps // every > saved // every:
                 self.save(about)
                 saved = self.steps
         self.save(about)
-        logger.close()
+        log.close()
 
     def _take(self, result: Mapping[str, Any]) -> None:
         metrics = result.get(ENV_RUNNER_RESULTS, {})
@@ -375,7 +391,7 @@ class Learning:
 
     def save(self, about: dict[str, Any]) -> None:
         """Saves the network and the optimiser."""
-        content = {"format": FORMAT, "about": json.dumps(about), "steps": self.steps}
+        content = {"format": FORMAT, "about": about, "steps": self.steps}
         optimiser = self.learner.get_optimizer().state_dict()
         states = {"network": self.module.state_dict(), "optimiser": optimiser}
         write_content(self.path, content | states)
@@ -383,8 +399,9 @@ class Learning:
     def resume(self, content: dict[str, Any]) -> None:
         """Continues with a checkpoint's network and optimiser; the worlds start afresh."""
         self.steps = int(content["steps"])
-        self.module.load_state_dict(content["network"])
-        self.learner.get_optimizer().load_state_dict(content["optimiser"])
+        self.module.load_state_dict(to_tensors(content["network"]))
+        optimiser = to_tensors(content["optimiser"])
+        self.learner.get_optimizer().load_state_dict(optimiser)
         self.algorithm.env_runner_group.sync_weights(
             from_worker_or_learner_group=self.algorithm.learner_group,
             inference_only=True,
@@ -401,10 +418,10 @@ def _build_algorithm(
 ) -> PPO:
     torch.set_num_threads(settings.threads)
     rng = np.random.default_rng(seed)
-    env = train.make_train_env(model, worlds, settings)
-    algorithms.check_serves(settings, env.envs[0])
+    env = train.make_training_worlds(model, worlds, settings)
+    check_serves(settings, env.envs[0])
     env.seed(int(rng.integers(train.SEEDS)))
-    normaliser = algorithms.observe_statistics(env, rng)
+    normaliser = observe_statistics(env, rng)
     spaces = env.observation_space, env.action_space
     env.close()
     make = ray.put(functools.partial(select_worlds, model, worlds, settings))
@@ -427,11 +444,11 @@ def select_worlds(
     settings: TrainingSettings,
     runner: int,
     runners: int,
-) -> TrainVecEnv:
+) -> TrainingWorlds:
     """Makes the worlds of env runner number `runner`: every `runners`-th."""
     names = [name for name, count in settings.worlds.items() for _ in range(count)]
     counts = dict(Counter(names[runner::runners]))
-    return train.make_train_env(
+    return train.make_training_worlds(
         model, worlds, settings.model_copy(update={"worlds": counts})
     )
 
@@ -446,7 +463,7 @@ def _make_config(
     chosen = settings.ppo
     left = max(settings.steps - done, 1)
     rate = chosen.learning_rate
-    now = rate * max(1.0 - done / settings.steps, algorithms.LEAST_RATE)
+    now = rate * max(1.0 - done / settings.steps, LEAST_RATE)
     network = {
         "hidden": settings.hidden,
         "normaliser": normaliser,
@@ -461,7 +478,7 @@ def _make_config(
         )
         .learners(num_learners=0)
         .training(
-            lr=[[0, now], [left, rate * algorithms.LEAST_RATE]],
+            lr=[[0, now], [left, rate * LEAST_RATE]],
             train_batch_size_per_learner=chosen.rollout * settings.num_envs,
             minibatch_size=chosen.batch,
             num_epochs=chosen.epochs,

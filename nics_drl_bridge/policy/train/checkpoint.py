@@ -8,33 +8,64 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_sealed, seal, write_bytes
 from nics_drl_bridge.lidar.arrays import AnyArray
-from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
+from nics_drl_bridge.policy.train.worlds import TrainingWorlds
 
-FORMAT = "nics_drl_bridge/checkpoint/5"
+FORMAT = "nics_drl_bridge/checkpoint/6"
 MOST_BYTES = 4 * 2**30  # maximum size of a file, which includes SAC's whole buffer
+CONTENT = "content"  # name of the array that holds everything else as JSON text
+ARRAY = "array"
+ITEMS = "items"
+"""Keys in the JSON text: the name of an array, and the keys and values of a dict."""
 
 
 def save_checkpoint(
-    path: Path, state: dict[str, Any], env: TrainVecEnv, about: dict[str, Any]
+    path: Path, state: dict[str, Any], worlds: TrainingWorlds, about: dict[str, Any]
 ) -> None:
     """Writes a checkpoint between two rollouts; `about` identifies the training."""
-    content = {"format": FORMAT, "about": json.dumps(about), "state": state}
-    write_content(
-        path, content | {"envs": [tensors(snapshot(worlds)) for worlds in env.envs]}
-    )
+    content = {"format": FORMAT, "about": about, "state": state}
+    write_content(path, content | {"envs": [snapshot(env) for env in worlds.envs]})
 
 
 def write_content(path: Path, content: dict[str, Any]) -> None:
-    """Writes a checkpoint of tensors, numbers and text, completely or not at all."""
+    """Writes a checkpoint, completely or not at all.
+
+    It may hold arrays, tensors, numbers and text in dicts and lists.
+    """
+    arrays: dict[str, AnyArray] = {}
+    text = json.dumps(_take_out_arrays(content, arrays))
+    arrays[CONTENT] = np.frombuffer(text.encode(), np.uint8)
     buffer = io.BytesIO()
-    torch.save(content, buffer)
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
     write_bytes(path, seal(buffer.getvalue()))
+
+
+def _take_out_arrays(content: Any, arrays: dict[str, AnyArray]) -> Any:
+    """Returns content as JSON allows it; moves its arrays and tensors into `arrays`."""
+    if isinstance(content, dict):
+        items = [[key, _take_out_arrays(content[key], arrays)] for key in content]
+        return {ITEMS: items}
+    if isinstance(content, list | tuple):
+        return [_take_out_arrays(part, arrays) for part in content]
+    if content is None or isinstance(content, bool | int | float | str):
+        return content
+    name = f"array_{len(arrays)}"
+    arrays[name] = np.asarray(content)
+    return {ARRAY: name}
+
+
+def _put_back_arrays(content: Any, arrays: Mapping[str, AnyArray]) -> Any:
+    if isinstance(content, list):
+        return [_put_back_arrays(part, arrays) for part in content]
+    if not isinstance(content, dict):
+        return content
+    if ARRAY in content:
+        return arrays[content[ARRAY]]
+    return {key: _put_back_arrays(value, arrays) for key, value in content[ITEMS]}
 
 
 def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
@@ -51,14 +82,13 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
             check_sealed(file)
             with zipfile.ZipFile(file) as archive:
                 if any(member.compress_type for member in archive.infolist()):
-                    raise ValueError("torch never compresses")
+                    raise ValueError("numpy compresses only on request")
             file.seek(0)
-            # weights_only blocks code in pickles; before torch 2.6 it had gaps.
-            content: Any = torch.load(file, map_location="cpu", weights_only=True)
-        _check_tensors(content, size)
-        format_name = str(content["format"])
-        read = {**content, "about": json.loads(content["about"])}
-    except Exception:  # noqa: BLE001 - a damaged file breaks torch in any way
+            with np.load(file, allow_pickle=False) as arrays:
+                content = json.loads(arrays[CONTENT].tobytes())
+                read = _put_back_arrays(content, arrays)
+        format_name = str(read["format"])
+    except Exception:  # noqa: BLE001 - a damaged file breaks numpy in any way
         raise ConfigError(
             f"{path}: is not a training checkpoint, or is damaged; leave out "
             "--resume to start again."
@@ -68,27 +98,7 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
             f"{path}: is a {format_name!r}, not a {kind!r}; resume with the same --engine "
             "and version."
         )
-    return read
-
-
-def _check_tensors(content: Any, size: int) -> None:
-    """Raises ValueError for a tensor larger than the file, such as one repeated number."""
-    parts = content.values() if isinstance(content, dict) else content
-    for part in parts if isinstance(content, dict | list | tuple) else ():
-        _check_tensors(part, size)
-    if (
-        isinstance(content, torch.Tensor)
-        and content.numel() * content.element_size() > size
-    ):
-        raise ValueError("a tensor is larger than the file")
-
-
-def tensors(arrays: dict[str, AnyArray]) -> dict[str, torch.Tensor]:
-    """Converts arrays by name to tensors."""
-    return {
-        name: torch.from_numpy(np.ascontiguousarray(rows))
-        for name, rows in arrays.items()
-    }
+    return dict(read)
 
 
 Arrays = dict[str, AnyArray]

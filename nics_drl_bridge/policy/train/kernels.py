@@ -5,7 +5,7 @@ small steps would compete for it with the collecting thread. Shapes: n transitio
 C outputs of the actor, W weights of a network.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,14 +32,13 @@ class Net(NamedTuple):
 
 
 class Transitions(NamedTuple):
-    """R transitions, step by step: arrays for the kernels, tensors elsewhere."""
+    """R transitions, step by step."""
 
-    observations: Any  # (R, O) normalised observations
-    # (R, C), or indices of discrete actions: (R,), or (R, 1) float32 for the kernels
-    actions: Any
-    log_probs: Any  # (R,) of the actions when they were drawn
-    advantages: Any  # (R,)
-    returns: Any  # (R,) targets of the critic
+    observations: Singles  # (R, O) normalised observations
+    actions: Singles  # (R, C), or (R, 1) indices of discrete actions
+    log_probs: Singles  # (R,) of the actions when they were drawn
+    advantages: Singles  # (R,)
+    returns: Singles  # (R,) targets of the critic
 
 
 @kernel(allocates=True)

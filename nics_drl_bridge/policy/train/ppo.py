@@ -10,25 +10,35 @@ core each for the rest of the update.
 
 from __future__ import annotations
 
-import copy
 import threading
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
-import torch
-from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.lidar.arrays import Singles
-from nics_drl_bridge.policy.train import algorithms, kernels
+from nics_drl_bridge.lidar.arrays import AnyArray, Integers, Singles
+from nics_drl_bridge.policy.train import kernels
 from nics_drl_bridge.policy.train.adam import Adam
-from nics_drl_bridge.policy.train.kernels import LOG_NORM, Net, Transitions
-from nics_drl_bridge.policy.train.progress import RECENT, Watch
-from nics_drl_bridge.policy.train.settings import PpoSettings, TrainingSettings
-from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
+from nics_drl_bridge.policy.train.kernels import Net, Transitions
+from nics_drl_bridge.policy.train.networks import (
+    ACTION_GAIN,
+    VALUE_GAIN,
+    Actor,
+    ActorCritic,
+    Network,
+)
+from nics_drl_bridge.policy.train.normaliser import Normaliser
+from nics_drl_bridge.policy.train.progress import RECENT, TrainingLog, Watch
+from nics_drl_bridge.policy.train.settings import (
+    LEAST_RATE,
+    PpoSettings,
+    TrainingSettings,
+)
+from nics_drl_bridge.policy.train.worlds import COLLISION, SUCCESS, TrainingWorlds
 from nics_drl_bridge.threads import one_blas_thread, run_parts
 
 Ended = list[tuple[bool, bool]]  # (success, collision) of ended episodes
@@ -38,93 +48,33 @@ VALUE_WEIGHT = 0.5  # of the value loss
 class Rollout(NamedTuple):
     """A rollout as collected: T steps of N worlds."""
 
-    observations: torch.Tensor  # (T + 1, N, O) normalised observations
-    actions: torch.Tensor  # (T, N, C), or (T, N) discrete
-    log_probs: torch.Tensor  # (T, N) of the actions when they were drawn
-    rewards: torch.Tensor  # (T, N)
-    dones: torch.Tensor  # (T, N) 1 at ends of episodes
-    truncated: torch.Tensor  # (K,) indices t N + n of the truncated episodes
-    final_observations: torch.Tensor  # (K, O) the last ones of these episodes
+    observations: Singles  # (T + 1, N, O) normalised observations
+    actions: AnyArray  # (T, N, C), or (T, N) discrete
+    log_probs: Singles  # (T, N) of the actions when they were drawn
+    rewards: Singles  # (T, N)
+    ended: Singles  # (T, N) 1 at ends of episodes
+    truncated: Integers  # (K,) indices t N + n of the truncated episodes
+    final_observations: Singles  # (K, O) the last ones of these episodes
 
 
-class Networks(torch.nn.Module):
-    """Actor and critic on normalised observations, and the deviation of continuous actions."""
-
-    def __init__(
-        self, actor: algorithms.Actor, hidden: tuple[int, ...], log_std: float
-    ) -> None:
-        super().__init__()
-        self.actor = actor
-        self.critic = algorithms.make_layers(
-            [actor.layers[0].in_features, *hidden, 1], 1.0, torch.nn.ReLU
-        )
-        outputs = actor.layers[-1].out_features
-        self.log_std = torch.nn.Parameter(
-            torch.full((0 if actor.discrete else outputs,), log_std)
-        )
-
-    def draw(self, raw: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Draws actions (n, C) or (n,), given the outputs (n, C) of the actor."""
-        if self.actor.discrete:
-            return torch.multinomial(raw.softmax(1), 1, generator=generator).squeeze(1)
-        return torch.normal(raw, self.log_std.exp().expand_as(raw), generator=generator)
-
-    def log_probs(self, raw: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """Returns the log probability or log density (n,) of actions (n, C) or (n,)."""
-        if self.actor.discrete:
-            return raw.log_softmax(1).gather(1, actions[:, None]).squeeze(1)
-        apart = (actions - raw) * torch.exp(-self.log_std)
-        return -0.5 * apart.square().sum(1) - (self.log_std + float(LOG_NORM)).sum()
-
-
-def flatten_weights(networks: Networks) -> tuple[Singles, Singles]:
-    """Moves all weights and gradients into one vector each (n,), and returns these.
-
-    The networks' weights and gradients become views of them.
-    """
-    parameters = list(networks.parameters())
-    weights = torch.nn.utils.parameters_to_vector(parameters).detach()
-    gradients = torch.zeros_like(weights)
-    sizes = [parameter.numel() for parameter in parameters]
-    parts = zip(parameters, weights.split(sizes), gradients.split(sizes), strict=True)
-    for parameter, values, gradient in parts:
-        parameter.data, parameter.grad = (
-            values.view_as(parameter),
-            gradient.view_as(parameter),
-        )
-    return weights.numpy(), gradients.numpy()
-
-
-def make_net(layers: torch.nn.Sequential, rows: int) -> Net:
-    """Returns the layers of a `flatten_weights` network for the kernels, with memory for `rows`."""
-    parameters = list(layers.parameters())
-    whole = (sum(parameter.numel() for parameter in parameters),)
-    weights, gradients = (
-        first.view(-1).as_strided(whole, (1,)).numpy()
-        for first in (parameters[0].detach(), parameters[0].grad)
-    )
-    widths = np.array(
-        [parameters[0].shape[1], *(len(bias) for bias in parameters[1::2])]
-    )
-    kept, spare = (
-        np.empty((k, rows * widths.max()), np.float32) for k in (len(widths) - 1, 2)
-    )
-    return Net(weights, gradients, widths, kept, spare)
+def make_net(network: Network, gradients: Singles, rows: int) -> Net:
+    """Returns a network for the kernels, with its gradients (W,) and memory for `rows`."""
+    widths = np.array(network.widths)
+    size = rows * max(network.widths)
+    kept = np.empty((len(widths) - 1, size), np.float32)
+    spare = np.empty((2, size), np.float32)
+    return Net(network.weights, gradients, widths, kept, spare)
 
 
 def estimate_advantages(
-    rewards: torch.Tensor,
-    values: torch.Tensor,
-    done: torch.Tensor,
-    discount: float,
-    decay: float,
-) -> torch.Tensor:
+    rewards: Singles, values: Singles, ended: Singles, discount: float, decay: float
+) -> Singles:
     """Returns generalised advantage estimates (T, N) (Schulman and others 2016).
 
-    Inputs are rewards (T, N), values (T + 1, N), and `done` (T, N), which is 1 at the ends of
+    Inputs are rewards (T, N), values (T + 1, N), and `ended` (T, N), which is 1 at the ends of
     episodes; `decay` is lambda.
     """
-    going = 1.0 - done
+    going = 1.0 - ended
     errors = rewards + discount * going * values[1:] - values[:-1]
     factors = discount * decay * going
     for t in range(len(errors) - 2, -1, -1):
@@ -136,201 +86,209 @@ class Learner:
     """Updates the weights by gradients of the loss."""
 
     def __init__(
-        self,
-        networks: Networks,
-        ppo: PpoSettings,
-        seed: int,
+        self, networks: ActorCritic, ppo: PpoSettings, rng: np.random.Generator
     ) -> None:
         self.networks = networks
         self.ppo = ppo
-        self.generator = torch.Generator().manual_seed(seed)
-        self.optimiser = Adam(*flatten_weights(networks))
-        self._nets = [
-            make_net(p, ppo.batch) for p in (networks.actor.layers, networks.critic)
-        ]
+        self.rng = rng
+        self.optimiser = Adam(networks.weights, np.zeros_like(networks.weights))
+        gradients = networks.split(self.optimiser.gradients)
+        self.log_std_gradient = gradients.log_std
+        self._actor = make_net(networks.actor, gradients.actor, ppo.batch)
+        self._critic = make_net(networks.critic, gradients.critic, ppo.batch)
         self.core_is_free = threading.Event()  # set when the collecting thread is done
 
     def compute_transitions(self, rollout: Rollout) -> Transitions:
         """Computes advantages and returns of a rollout, with the current critic."""
-        networks = self.networks
+        critic = self.networks.critic
         ppo = self.ppo
-        with torch.no_grad():
-            values = networks.critic(rollout.observations).squeeze(-1)
-            rewards = rollout.rewards.clone()
-            # Bootstrap where a time limit truncated the episode.
-            final_values = networks.critic(rollout.final_observations).squeeze(-1)
-            rewards.view(-1)[rollout.truncated] += ppo.discount * final_values
+        width = rollout.observations.shape[-1]
+        rows = rollout.observations.reshape(-1, width)
+        values = critic(rows).reshape(rollout.observations.shape[:-1])
+        rewards = rollout.rewards.copy()
+        # Bootstrap where a time limit truncated the episode.
+        final_values = critic(rollout.final_observations)[:, 0]
+        rewards.reshape(-1)[rollout.truncated] += (
+            np.float32(ppo.discount) * final_values
+        )
         advantages = estimate_advantages(
-            rewards, values, rollout.dones, ppo.discount, ppo.gae_lambda
+            rewards, values, rollout.ended, ppo.discount, ppo.gae_lambda
         )
-        rows = (
-            rollout.observations[:-1],
-            rollout.actions,
-            rollout.log_probs,
-            advantages,
-            advantages + values[:-1],
+        count = advantages.size
+        return Transitions(
+            rows[:count],
+            rollout.actions.reshape(count, -1).astype(np.float32),
+            rollout.log_probs.reshape(count),
+            advantages.reshape(count).astype(np.float32),
+            (advantages + values[:-1]).reshape(count).astype(np.float32),
         )
-        return Transitions(*(field.flatten(0, 1) for field in rows))
 
-    def learn(self, rollout: Transitions, rate: float) -> float:
+    def learn(self, transitions: Transitions, rate: float) -> float:
         """Learns from a rollout at a learning rate; returns the loss of the last batch."""
+        count = len(transitions.observations)
         for _ in range(self.ppo.epochs):
-            order = torch.randperm(len(rollout.observations), generator=self.generator)
-            for rows in order.split(self.ppo.batch):  # the last may be smaller
-                batch = Transitions(*(field[rows] for field in rollout))
-                loss = self.differentiate(batch)
+            order = self.rng.permutation(count)
+            for begin in range(0, count, self.ppo.batch):  # the last may be smaller
+                rows = order[begin : begin + self.ppo.batch]
+                # `take` releases the interpreter lock for the collecting thread
+                batch = [field.take(rows, axis=0) for field in transitions]
+                loss = self.differentiate(Transitions(*batch))
                 self.optimiser.step(rate)
-        return float(loss)
+        return loss
 
-    def differentiate(self, batch: Transitions) -> torch.Tensor:
+    def differentiate(self, batch: Transitions) -> float:
         """Sets the gradients of all weights for a batch; returns the loss."""
-        columns = batch.actions.float().view(len(batch.observations), -1)
-        fields = batch._replace(actions=columns)
-        arrays = Transitions(*(field.numpy() for field in fields))
-        actor, critic = self._nets
-        log_std = self.networks.log_std
         jobs: list[Callable[[], Any]] = [
             partial(
                 kernels.compute_actor_gradients,
-                actor,
-                arrays,
-                log_std.detach().numpy(),
-                log_std.grad.numpy(),
+                self._actor,
+                batch,
+                self.networks.log_std,
+                self.log_std_gradient,
                 np.float32(self.ppo.clip),
                 np.float32(self.ppo.entropy),
             ),
             partial(
                 kernels.compute_critic_gradients,
-                critic,
-                arrays,
+                self._critic,
+                batch,
                 np.float32(VALUE_WEIGHT),
             ),
         ]
-        free = self.core_is_free.is_set()
-        losses = run_parts(lambda job: job(), jobs) if free else [job() for job in jobs]
-        return torch.tensor(sum(losses))
+        if self.core_is_free.is_set():
+            losses = run_parts(lambda job: job(), jobs)
+        else:
+            losses = [job() for job in jobs]
+        return float(sum(losses))
 
 
 class Collector:
     """Steps the worlds with a copy of the networks."""
 
     def __init__(
-        self, env: TrainVecEnv, networks: Networks, ppo: PpoSettings, seed: int
+        self,
+        worlds: TrainingWorlds,
+        networks: ActorCritic,
+        normaliser: Normaliser,
+        steps: int,
+        rng: np.random.Generator,
     ) -> None:
-        self.env = env
-        self.networks = copy.deepcopy(networks)
-        self.ppo = ppo
-        self.generator = torch.Generator().manual_seed(seed)
-        self.last = np.zeros((env.num_envs, *env.observation_space.shape), np.float32)
+        self.worlds = worlds
+        self.networks = networks.copy()
+        self.normaliser = normaliser
+        self.steps = steps
+        self.rng = rng
+        shape = (worlds.num_envs, *worlds.observation_space.shape)
+        self.last: Singles = np.zeros(shape, np.float32)
 
     def collect(self) -> tuple[Rollout, Ended]:
         """Steps all worlds through a rollout."""
-        steps = self.ppo.rollout
-        worlds = self.env.num_envs
+        count = self.worlds.num_envs
+        space = self.worlds.action_space
         networks = self.networks
-        space = cast("Any", self.env.action_space)
-        observations = torch.empty(steps + 1, worlds, networks.critic[0].in_features)
-        rewards, dones = torch.zeros(2, steps, worlds)
-        outputs = []
+        observations = np.empty((self.steps + 1, *self.last.shape), np.float32)
+        rewards = np.zeros((self.steps, count), np.float32)
+        ended = np.zeros((self.steps, count), np.float32)
         actions = []
-        outcomes = []
-        truncated = []
-        final = [observations[0, :0]]  # so that `cat` works without any truncation
-        with torch.no_grad():
-            for t in range(steps):
-                observations[t] = self._normalize(self.last)
-                outputs.append(networks.actor.layers(observations[t]))
-                actions.append(networks.draw(outputs[t], self.generator))
-                env_actions = actions[t].numpy()
-                if not networks.actor.discrete:
-                    env_actions = np.clip(env_actions, space.low, space.high)
-                self.last, reward, ended, infos = self.env.step(env_actions)
-                rewards[t] = torch.from_numpy(reward)
-                dones[t] = torch.from_numpy(ended)
-                for n in np.flatnonzero(ended):
-                    info = infos[n]
-                    outcomes.append(
-                        (info.get("is_success", False), info.get("collision", False))
-                    )
-                    if info["TimeLimit.truncated"]:
-                        truncated.append(t * worlds + int(n))
-                        last = info["terminal_observation"][None]
-                        final.append(self._normalize(last))
-            observations[steps] = self._normalize(self.last)
-            all_actions = torch.stack(actions)
-            log_probs = networks.log_probs(
-                torch.cat(outputs), all_actions.flatten(0, 1)
-            )
-            rollout = Rollout(
-                observations,
-                all_actions,
-                log_probs.view_as(rewards),
-                rewards,
-                dones,
-                torch.tensor(truncated, dtype=torch.int64),
-                torch.cat(final),
-            )
-            return rollout, outcomes
-
-    def _normalize(self, observations: Singles) -> torch.Tensor:
-        """Returns normalised observations (n, O) for the networks."""
-        normalised: torch.Tensor = self.networks.actor.normaliser(
-            torch.from_numpy(observations)
+        log_probs = []
+        outcomes: Ended = []
+        truncated = [np.zeros(0, np.int64)]
+        final = [self.last[:0]]
+        for t in range(self.steps):
+            observations[t] = self.normaliser(self.last)
+            raw = networks.actor(observations[t])
+            chosen = networks.draw(raw, self.rng)
+            actions.append(chosen)
+            log_probs.append(networks.compute_log_probs(raw, chosen))
+            if isinstance(space, gymnasium.spaces.Box):
+                chosen = np.clip(chosen, space.low, space.high)
+            step = self.worlds.step(chosen)
+            self.last = step.observations
+            rewards[t] = step.rewards
+            ended[t] = step.ended
+            endings = step.endings
+            flags = endings.told(SUCCESS), endings.told(COLLISION)
+            outcomes += zip(*(flag.tolist() for flag in flags), strict=True)
+            cut = endings.truncated
+            truncated.append(t * count + endings.worlds[cut])
+            final.append(self.normaliser(endings.observations[cut]))
+        observations[self.steps] = self.normaliser(self.last)
+        rollout = Rollout(
+            observations,
+            np.stack(actions),
+            np.stack(log_probs),
+            rewards,
+            ended,
+            np.concatenate(truncated),
+            np.concatenate(final),
         )
-        return normalised
+        return rollout, outcomes
 
 
 class LeanPpo:
-    """A training with PPO; `normaliser` is mean, deviation (O,). Raises: see `check_serves`."""
+    """A training with PPO; `normaliser` is mean and deviation (O,)."""
 
     def __init__(
         self,
         settings: TrainingSettings,
-        env: TrainVecEnv,
+        worlds: TrainingWorlds,
         seed: int,
         normaliser: tuple[Array, Array],
     ) -> None:
-        algorithms.check_serves(settings, env.envs[0])
-        torch.set_num_threads(settings.threads)
-        torch.manual_seed(seed)
         self._total = settings.steps
         self._ppo = settings.ppo
-        hidden = settings.hidden
-        spaces = env.observation_space, env.action_space
-        actor = algorithms.Actor(*spaces, hidden, normaliser, torch.nn.ReLU)
-        self.networks = Networks(actor, hidden, self._ppo.log_std)
-        seeds = np.random.SeedSequence(seed).generate_state(2)
-        self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]))
-        self.learner = Learner(self.networks, self._ppo, int(seeds[1]))
-        self.policy = actor
-        self._settings = settings
+        networks = ActorCritic(
+            gymnasium.spaces.flatdim(worlds.observation_space),
+            gymnasium.spaces.flatdim(worlds.action_space),
+            settings.hidden,
+            isinstance(worlds.action_space, gymnasium.spaces.Discrete),
+        )
+        parts = np.random.SeedSequence(seed).spawn(3)
+        initial, collecting, learning = map(np.random.default_rng, parts)
+        networks.actor.initialise(ACTION_GAIN, initial)
+        networks.critic.initialise(VALUE_GAIN, initial)
+        networks.log_std[:] = self._ppo.log_std
+        self.networks = networks
+        see = Normaliser.of(worlds.observation_space, *normaliser)
+        self.algorithm = Actor(see, networks.actor, networks.is_discrete)
+        self.collector = Collector(worlds, networks, see, self._ppo.rollout, collecting)
+        self.learner = Learner(networks, self._ppo, learning)
         self.steps = 0  # number of steps learnt from, over all worlds
         self._rollout: Rollout | None = None  # the next rollout to learn from
         self._successes: deque[bool] = deque(maxlen=RECENT)
 
+    @property
+    def greatest_weight(self) -> float:
+        """Largest magnitude of a weight; NaN if one is not a number."""
+        return float(np.abs(self.networks.weights).max())
+
+    def act(self, observations: Singles) -> AnyArray:
+        """Returns the most likely actions for observations."""
+        return self.algorithm.act(observations)
+
     @one_blas_thread
-    def learn(self, watch: Watch, logger: Logger) -> None:
+    def learn(self, watch: Watch, log: TrainingLog) -> None:
         """Learns until all steps are done, or the watch ends the training."""
         watch.begin(self.steps)
         if self._rollout is None:
-            self.collector.last = self.collector.env.reset()
+            self.collector.last = self.collector.worlds.reset()
             self._take(watch, *self.collector.collect())
         while self._rollout is not None:
             watch.keep(self.steps)
-            if watch.ends(self.steps, algorithms.make_act(self.policy), logger):
-                watch.report(self.steps, self._successes, logger)
+            if watch.ends(self.steps, self.act, log):
+                watch.report(self.steps, self._successes, log)
                 return
             loss = self._advance(self._rollout, watch)
-            if watch.report(self.steps, self._successes, logger):
-                logger.record("train/loss", loss)
-                logger.dump(self.steps)
+            if watch.report(self.steps, self._successes, log):
+                log.record("train/loss", loss)
+                log.dump(self.steps)
 
     def _advance(self, rollout: Rollout, watch: Watch) -> float:
         """Learns from a rollout while the next one is collected."""
         left = 1.0 - self.steps / self._total
-        rate = self._ppo.learning_rate * max(left, algorithms.LEAST_RATE)
-        self.steps += self._ppo.rollout * self.collector.env.num_envs
-        self.collector.networks.load_state_dict(self.networks.state_dict())
+        rate = self._ppo.learning_rate * max(left, LEAST_RATE)
+        self.steps += self._ppo.rollout * self.collector.worlds.num_envs
+        self.collector.networks.weights[:] = self.networks.weights
         learner = self.learner
         jobs: list[Callable[[], Any]] = [
             lambda: learner.learn(learner.compute_transitions(rollout), rate)
@@ -347,7 +305,6 @@ class LeanPpo:
         return float(loss)
 
     def _collect(self) -> tuple[Rollout, Ended]:
-        torch.set_num_threads(self._settings.threads)  # a per-thread setting
         try:
             return self.collector.collect()
         finally:
@@ -361,34 +318,39 @@ class LeanPpo:
     def state(self) -> dict[str, Any]:
         """Returns everything that changes, for a checkpoint."""
         optimiser = self.learner.optimiser
+        normaliser = self.algorithm.normaliser
         return {
-            "weights": self.networks.state_dict(),
+            "weights": self.networks.weights,
             "optimiser": {
                 "steps": optimiser.steps,
-                "mean": torch.from_numpy(optimiser.mean),
-                "square": torch.from_numpy(optimiser.square),
+                "mean": optimiser.mean,
+                "square": optimiser.square,
             },
+            "normaliser": {"mean": normaliser.mean, "std": normaliser.std},
             "steps": self.steps,
             "recent": list(self._successes),
-            "last": torch.from_numpy(self.collector.last),
+            "last": self.collector.last,
             "rollout": self._rollout and self._rollout._asdict(),
             "random": [
-                part.generator.get_state() for part in (self.collector, self.learner)
+                part.rng.bit_generator.state for part in (self.collector, self.learner)
             ],
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continues from the state of another training made with the same arguments."""
-        self.networks.load_state_dict(state["weights"])
+        self.networks.weights[:] = state["weights"]
         optimiser = self.learner.optimiser
         optimiser.steps = state["optimiser"]["steps"]
         optimiser.mean[:] = state["optimiser"]["mean"]
         optimiser.square[:] = state["optimiser"]["square"]
+        normaliser = self.algorithm.normaliser
+        normaliser.mean[:] = state["normaliser"]["mean"]
+        normaliser.std[:] = state["normaliser"]["std"]
         self.steps = state["steps"]
         rollout = state["rollout"]
         self._rollout = rollout and Rollout(**rollout)
         self._successes.extend(state["recent"])
-        self.collector.last = state["last"].numpy()
-        generators = self.collector.generator, self.learner.generator
-        for generator, random in zip(generators, state["random"], strict=True):
-            generator.set_state(random)
+        self.collector.last = state["last"]
+        collecting, learning = state["random"]
+        self.collector.rng.bit_generator.state = collecting
+        self.learner.rng.bit_generator.state = learning

@@ -5,14 +5,19 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from stable_baselines3.common.logger import Logger
+from tensorboard.compat.proto.event_pb2 import Event  # type: ignore[import-untyped]
+from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[import-untyped]
+from tensorboard.summary.writer.event_file_writer import (  # type: ignore[import-untyped]
+    EventFileWriter,
+)
 
 from nics_drl_bridge.policy.evaluation import Act
 from nics_drl_bridge.policy.train.settings import TrainingSettings
 from nics_drl_bridge.policy.train.stop import Stop
-from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
+from nics_drl_bridge.policy.train.worlds import TrainingWorlds
 
 RECENT = 1000  # number of recent episodes over which the progress reports rates
 TOLD_S = 0.2  # minimum time between two progress reports [s]
@@ -47,11 +52,39 @@ class Progress:
 Tell = Callable[[Progress], None]
 
 
+class TrainingLog:
+    """Writes figures over environment steps into a folder, for TensorBoard."""
+
+    def __init__(self, folder: Path) -> None:
+        self._writer = EventFileWriter(str(folder))
+        self._figures: dict[str, float] = {}
+
+    def record(self, name: str, value: float) -> None:
+        """Sets a figure of the next `dump`."""
+        self._figures[name] = value
+
+    def dump(self, steps: int) -> None:
+        """Writes the figures recorded since the last dump."""
+        values = [
+            Summary.Value(tag=name, simple_value=value)
+            for name, value in self._figures.items()
+        ]
+        self._figures.clear()
+        summary = Summary(value=values)
+        self._writer.add_event(
+            Event(step=steps, wall_time=time.time(), summary=summary)
+        )
+
+    def close(self) -> None:
+        """Writes what is left, and closes the file."""
+        self._writer.close()
+
+
 @dataclass
 class Watch:
     """Reports the progress of a training and saves it at intervals, between two rollouts."""
 
-    env: TrainVecEnv
+    worlds: TrainingWorlds
     seed: int
     settings: TrainingSettings
     save: Callable[[], None]
@@ -64,7 +97,7 @@ class Watch:
     def begin(self, steps: int) -> None:
         """Starts the clock of a training that has already done `steps`."""
         self._begin = self._told = time.perf_counter()
-        self._busy = self.env.stepping_s
+        self._busy = self.worlds.stepping_s
         self._first = self._saved = steps
 
     def keep(self, steps: int) -> None:
@@ -74,15 +107,15 @@ class Watch:
             self.save()
             self._saved = steps
 
-    def ends(self, steps: int, act: Act, logger: Logger) -> bool:
+    def ends(self, steps: int, act: Act, log: TrainingLog) -> bool:
         """Evaluates on held-out episodes if due; returns True if the training should end."""
         if self.stop.judge(steps, act):
             for world, share in self.stop.shares.items():
-                logger.record(f"held_out/{world}", share)
-            logger.dump(steps)
+                log.record(f"held_out/{world}", share)
+            log.dump(steps)
         return self.stop.over
 
-    def report(self, steps: int, successes: Sequence[bool], logger: Logger) -> bool:
+    def report(self, steps: int, successes: Sequence[bool], log: TrainingLog) -> bool:
         """Reports and logs the progress if due; returns True if it did."""
         now = time.perf_counter()
         total = self.settings.steps
@@ -99,11 +132,11 @@ class Watch:
             success,
             collision,
             (steps - self._first) / taken,
-            (self.env.stepping_s - self._busy) / taken,
+            (self.worlds.stepping_s - self._busy) / taken,
             self.stop.least,
         )
-        logger.record("rollout/success_rate", progress.success)
-        logger.record("rollout/collision_rate", progress.collision)
-        logger.record("time/env_share", progress.env_share)
+        log.record("rollout/success_rate", progress.success)
+        log.record("rollout/collision_rate", progress.collision)
+        log.record("time/env_share", progress.env_share)
         self.tell(progress)
         return True

@@ -7,46 +7,47 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import filelock
 import gymnasium
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.logger import configure
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.config import dump_yaml, list_shipped
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, shorten
 from nics_drl_bridge.files import format_json, write_text
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.arrays import AnyArray, Singles
 from nics_drl_bridge.policy.evaluation import (
     FIRST_SEED,
+    Act,
     Outcomes,
     Summary,
     drive_worlds,
     summarise,
 )
-from nics_drl_bridge.policy.train import algorithms as algorithms
 from nics_drl_bridge.policy.train import checkpoint as checkpoints
-from nics_drl_bridge.policy.train.algorithms import Actor, Sb3Training
 from nics_drl_bridge.policy.train.export import export_policy
+from nics_drl_bridge.policy.train.normaliser import observe_statistics
 from nics_drl_bridge.policy.train.ppo import LeanPpo
-from nics_drl_bridge.policy.train.progress import Tell, Watch
+from nics_drl_bridge.policy.train.progress import Tell, TrainingLog, Watch
 from nics_drl_bridge.policy.train.settings import (
     Opened,
     TrainingSettings,
+    check_serves,
     is_code,
     open_training,
     read_settings,
 )
 from nics_drl_bridge.policy.train.stop import Stop
-from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
+from nics_drl_bridge.policy.train.worlds import TrainingWorlds
 from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-CHECKPOINT = "checkpoint.pt"
+CHECKPOINT = "checkpoint.npz"
 SETTINGS = "settings.yaml"
 LOCK = ".lock"
 EVALUATION = "evaluation.json"
@@ -63,7 +64,9 @@ Worlds = Mapping[str, AnyWorld]  # by their names in the settings
 class Trained:
     """The result of a training."""
 
-    algorithm: BaseAlgorithm | Actor  # the trained algorithm, or only its actor
+    # what can be exported: Stable-Baselines3's algorithm, or an actor
+    algorithm: Any
+    act: Act  # its policy, without exploration noise
     steps: int  # environment steps of all worlds together
     wall_s: float  # wall time of this process [s]
     stepping_s: float  # part of it spent in the simulator [s]
@@ -77,70 +80,106 @@ def train(
     folder: Path,
     tell: Tell = lambda _: None,
     resumed: bool = False,
-    on_env: Callable[[TrainVecEnv], None] = lambda _: None,
+    on_worlds: Callable[[TrainingWorlds], None] = lambda _: None,
 ) -> Trained:
     """Trains a policy, or resumes its training in `folder` bit-identically. Raises ConfigError.
 
-    `on_env` gets the worlds before the first step, for example to set their `on_step`.
+    `on_worlds` gets the worlds before the first step, for example to set their `on_step`.
     """
     begin = time.perf_counter()
     path = folder / CHECKPOINT
     content = checkpoints.read_checkpoint(path) if resumed else None
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
-    env = make_train_env(model, worlds, settings)
+    joined = make_training_worlds(model, worlds, settings)
+    check_serves(settings, joined.envs[0])
     stop = _stop_of(model, worlds, settings)
-    on_env(env)
-    engine = LeanPpo if settings.lean else Sb3Training
+    on_worlds(joined)
+    engine = _find_engine(settings)
     if content is None:
         rng = np.random.default_rng(seed)
-        env.seed(int(rng.integers(SEEDS)))
-        training = engine(settings, env, seed, algorithms.observe_statistics(env, rng))
+        joined.seed(int(rng.integers(SEEDS)))
+        training = engine(settings, joined, seed, observe_statistics(joined, rng))
         # Overrides the algorithm's seeds, which would overlap those of other runs.
-        env.seed(int(rng.integers(SEEDS)))
+        joined.seed(int(rng.integers(SEEDS)))
     else:
         check_same(content["about"], about, path)
-        nothing = np.zeros(env.observation_space.shape).ravel()
-        training = engine(settings, env, seed, (nothing, nothing + 1.0))
-        _restore(content, (training, stop), env, path)
-    busy = env.stepping_s
+        nothing = np.zeros(joined.observation_space.shape)
+        training = engine(settings, joined, seed, (nothing, nothing + 1.0))
+        _restore(content, (training, stop), joined, path)
+    busy = joined.stepping_s
 
     def save() -> None:
         # Check before replacing a checkpoint that can still be resumed.
         refuse_diverged(training)
-        checkpoints.save_checkpoint(path, training.state() | stop.state(), env, about)
+        state = training.state() | stop.state()
+        checkpoints.save_checkpoint(path, state, joined, about)
 
     if training.steps < settings.steps and not stop.over:
-        logger = configure(str(folder), ["tensorboard"])
+        log = TrainingLog(folder)
+        watch = Watch(joined, seed, settings, save, tell, stop)
         try:
-            training.learn(Watch(env, seed, settings, save, tell, stop), logger)
+            training.learn(watch, log)
         except (RuntimeError, ValueError, gymnasium.error.InvalidAction):
             refuse_diverged(training, MOST_WEIGHT)
             raise
         save()
-        logger.close()
+        log.close()
     return Trained(
-        training.policy,
+        training.algorithm,
+        training.act,
         training.steps,
         wall_s=time.perf_counter() - begin,
-        stepping_s=env.stepping_s - busy,
+        stepping_s=joined.stepping_s - busy,
     )
 
 
-def refuse_diverged(training: LeanPpo | Sb3Training, bound: float = math.inf) -> None:
+class Training(Protocol):
+    """A training in progress, of any engine."""
+
+    algorithm: Any  # see `Trained`
+
+    @property
+    def steps(self) -> int:
+        """Environment steps done, over all worlds."""
+
+    @property
+    def greatest_weight(self) -> float:
+        """Largest magnitude of a weight; NaN if one is not a number."""
+
+    def act(self, observations: Singles) -> AnyArray:
+        """Returns actions without exploration noise."""
+
+    def learn(self, watch: Watch, log: TrainingLog) -> None:
+        """Learns until all steps are done, or the watch ends the training."""
+
+    def state(self) -> dict[str, Any]:
+        """Returns everything that changes, for a checkpoint."""
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continues from the state of another training made with the same arguments."""
+
+
+def _find_engine(settings: TrainingSettings) -> Callable[..., Training]:
+    if settings.lean:
+        return LeanPpo
+    with extensions.require_modules("Stable-Baselines3's engine"):
+        from nics_drl_bridge.policy.train.sb3 import Sb3Training
+    return Sb3Training
+
+
+def refuse_diverged(training: Training, bound: float = math.inf) -> None:
     """Raises ConfigError if a weight of the training is not finite or exceeds a bound."""
-    if not all(
-        bool((part.abs() < bound).all()) for part in training.networks.parameters()
-    ):
+    if not training.greatest_weight < bound:
         raise ConfigError(
             f"the training diverged: after {training.steps} steps its weights are too large or "
             "not finite; lower its learning_rate."
         )
 
 
-def make_train_env(
+def make_training_worlds(
     model: SimulatorModel, worlds: Worlds, settings: TrainingSettings
-) -> TrainVecEnv:
-    """Makes one env of all worlds of the settings."""
+) -> TrainingWorlds:
+    """Makes all worlds of the settings."""
     margin = settings.teaching.margin
     if margin:
         model = replace(model, robot=model.robot.grow_footprint(margin))
@@ -148,21 +187,20 @@ def make_train_env(
     for world, count in settings.worlds.items():
         envs.append(_make_env(model, worlds[world], settings, count, "SameStep"))
         envs[-1].teach(settings.teaching)
-    return TrainVecEnv(*envs)
+    return TrainingWorlds(*envs)
 
 
 def _restore(
     content: dict[str, Any],
-    parts: Iterable[LeanPpo | Sb3Training | Stop],
-    env: TrainVecEnv,
+    parts: Iterable[Training | Stop],
+    joined: TrainingWorlds,
     path: Path,
 ) -> None:
     try:
         for part in parts:
             part.restore(content["state"])
-        for worlds, state in zip(env.envs, content["envs"], strict=True):
-            arrays = {name: value.numpy() for name, value in state.items()}
-            checkpoints.restore(worlds, arrays)
+        for env, arrays in zip(joined.envs, content["envs"], strict=True):
+            checkpoints.restore(env, arrays)
     except (
         AttributeError,
         IndexError,
@@ -201,16 +239,16 @@ def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
 
 
 def evaluate(
-    algorithm: BaseAlgorithm | Actor,
+    act: Act,
     model: SimulatorModel,
     world: AnyWorld,
     settings: TrainingSettings,
     episodes: int,
 ) -> Outcomes:
-    """Runs the evaluation protocol's episodes in a world with an algorithm's policy."""
+    """Runs the evaluation protocol's episodes in a world with a policy."""
     env = _make_env(model, world, settings, episodes)
     seeds = range(FIRST_SEED, FIRST_SEED + episodes)
-    return drive_worlds(env, algorithms.make_act(algorithm), seeds)
+    return drive_worlds(env, act, seeds)
 
 
 def _stop_of(model: SimulatorModel, worlds: Worlds, settings: TrainingSettings) -> Stop:
@@ -308,7 +346,7 @@ def run(
             for name in settings.worlds:
                 evaluating(name)
                 driven = evaluate(
-                    trained.algorithm, model, worlds[name], settings, order.episodes
+                    trained.act, model, worlds[name], settings, order.episodes
                 )
                 summaries[name] = summarise(driven, model.control_period)
             result = SeedResult(seed, trained, summaries)
@@ -345,7 +383,7 @@ def _try_task(
 ) -> None:
     """Refuses a task that does not serve or gives no finite numbers, before a folder is made."""
     env = _make_env(model, worlds[next(iter(settings.worlds))], settings, TRIED)
-    algorithms.check_serves(settings, env)
+    check_serves(settings, env)
     env.reset(seed=FIRST_SEED)
     for _ in range(TRIED):
         env.step(env.action_space.sample())

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
+import gymnasium
 from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge import defaults
@@ -20,6 +21,7 @@ from nics_drl_bridge.config import (
 )
 from nics_drl_bridge.env.registry import find_task_class
 from nics_drl_bridge.env.teaching import Teaching
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.lidar.sectors import LAYOUTS, count_sectors, covers
@@ -39,6 +41,7 @@ Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 DISCOUNT = 0.98  # of both algorithms
 OWN_TASK = "navigation"  # task whose settings user-defined robots inherit
 LEAST_S = 30.0  # minimum time limit [s]
+LEAST_RATE = 0.02  # final fraction of PPO's learning rate
 ROOM = 1.8  # factor on the straight-line time, for detours, turns and slow sections
 
 
@@ -111,7 +114,7 @@ class TrainingSettings(Schema):
     hidden: tuple[Width, ...] = Field(
         default=(64, 64), min_length=1, max_length=MOST_LAYERS
     )
-    # threads of PyTorch; results depend slightly on their number
+    # threads of PyTorch, for its engines; results depend slightly on their number
     threads: Annotated[int, Field(ge=1, le=1024)] = 1
     checkpoint_every: Count = 200_000  # environment steps between two checkpoints
     ppo: PpoSettings = PpoSettings()  # used if `algorithm` is `ppo`
@@ -381,3 +384,21 @@ def _stretch(
     discount = round(1.0 - (1.0 - learner.discount) / factor, 6)
     notes.append(f"{name}.discount {discount:g}, was {learner.discount:g}")
     return {name: learner.model_copy(update={"discount": discount})}
+
+
+def check_serves(settings: TrainingSettings, env: BridgeVectorEnv) -> None:
+    """Raises ConfigError if the algorithm does not suit task and settings, or for a team's task."""
+    if env.robots > 1:
+        raise ConfigError(
+            f"task {settings.task!r}: has {env.robots} robots; train a single-robot task, or use "
+            "your own learner (docs/environments.md)."
+        )
+    continuous = isinstance(env.single_action_space, gymnasium.spaces.Box)
+    if settings.algorithm == "sac" and not continuous:
+        raise ConfigError("algorithm 'sac' needs continuous actions; use 'ppo'.")
+    size = settings.ppo.rollout * settings.num_envs
+    if settings.algorithm == "ppo" and settings.ppo.batch > size:
+        raise ConfigError(
+            f"ppo.batch {settings.ppo.batch}: exceeds the {size} transitions of a rollout; lower "
+            "it, or raise ppo.rollout or worlds."
+        )

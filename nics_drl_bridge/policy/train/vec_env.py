@@ -1,116 +1,77 @@
 """Adapts the vector env to Stable-Baselines3's VecEnv, without copying each world."""
 
-import itertools
-import time
-from collections.abc import Callable, Sequence
+from __future__ import annotations
+
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.arrays import AnyArray, Mask, Singles
+from nics_drl_bridge.policy.train.worlds import TrainingWorlds
 
 with extensions.require_modules("TrainVecEnv"):
     from stable_baselines3.common.vec_env import VecEnv
-
-Observation = NDArray[np.float32]
 
 
 class TrainVecEnv(VecEnv):
     """Adapts `BridgeVectorEnv`s (`SameStep`, `copy=True`) to SB3. Raises ConfigError for others."""
 
     def __init__(self, *envs: BridgeVectorEnv) -> None:
-        for env in envs:
-            if (
-                env.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP
-                or not env.copy
-            ):
-                raise ConfigError(
-                    "Stable-Baselines3 needs "
-                    "BridgeVectorEnv(autoreset_mode='SameStep', copy=True)."
-                )
-        first = envs[0]
-        spaces = [env.single_observation_space for env in envs]
-        for space in spaces:
-            if space != spaces[0]:
-                raise ConfigError(
-                    f"the combined vector envs have the spaces {spaces[0]} and {space}; use the "
-                    "same robot, lidar and task."
-                )
-        self.envs = envs
-        edges = np.cumsum([0, *(env.num_envs for env in envs)])
-        self._rows = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
-        count = int(edges[-1])
-        super().__init__(
-            count, first.single_observation_space, first.single_action_space
-        )
-        self._infos: list[dict[str, Any]] = [{} for _ in range(count)]
+        self._adapt(TrainingWorlds(*envs))
+
+    @classmethod
+    def of(cls, worlds: TrainingWorlds) -> TrainVecEnv:
+        """Adapts the worlds of a training."""
+        env = cls.__new__(cls)
+        env._adapt(worlds)
+        return env
+
+    def _adapt(self, worlds: TrainingWorlds) -> None:
+        self.worlds = worlds
+        self.envs = worlds.envs
+        super().__init__(worlds.num_envs, worlds.observation_space, worlds.action_space)
+        self._infos: list[dict[str, Any]] = [{} for _ in range(worlds.num_envs)]
         self._ended: list[int] = []
         self._actions: AnyArray = np.zeros(0)
-        self.stepping_s = 0.0  # wall time in the envs [s]
-        # called after each step of all worlds
-        self.on_step: Callable[[], None] | None = None
 
-    def reset(self) -> Observation:
+    def seed(self, seed: int | None = None) -> Sequence[int]:
+        """Sets the seeds of the next `reset`: `seed` plus the index of the world."""
+        seeds: Sequence[int] = super().seed(seed)
+        self.worlds.seed(seeds[0])
+        return seeds
+
+    def reset(self) -> Singles:
         """Starts an episode in every world, with the seeds given to `seed`."""
-        observations = []
-        for env, rows in zip(self.envs, self._rows, strict=True):
-            seeds_of_env = self._seeds[rows]
-            seeds = None if all(seed is None for seed in seeds_of_env) else seeds_of_env
-            observations.append(
-                env.reset(seed=seeds, options=self._options[0] or None)[0]
-            )
+        observations = self.worlds.reset(self._options[0] or None)
         self._reset_seeds()
         self._reset_options()
-        return _join_rows(observations)
+        return observations
 
     def step_async(self, actions: AnyArray) -> None:
         """Stores the actions for the next step."""
         self._actions = actions
 
-    def step_wait(
-        self,
-    ) -> tuple[Observation, Singles, Mask, list[Any]]:
+    def step_wait(self) -> tuple[Singles, Singles, Mask, list[Any]]:
         """Advances every world by one control period; see Stable-Baselines3."""
-        begin = time.perf_counter()
-        self._clear_infos()
-        parts = []
-        for env, rows in zip(self.envs, self._rows, strict=True):
-            *seen, terminated, truncated, info = env.step(self._actions[rows])
-            ended = terminated | truncated
-            parts.append((*seen, ended))
-            if ended.any():
-                self._fill_infos(rows.start, ended, truncated & ~terminated, info)
-        observations, rewards, dones = map(_join_rows, zip(*parts, strict=True))
-        self.stepping_s += time.perf_counter() - begin
-        if self.on_step is not None:
-            self.on_step()
-        return observations, rewards.astype(np.float32), dones, list(self._infos)
-
-    def _clear_infos(self) -> None:
-        """Puts new dicts in place of those of ended worlds, which an algorithm may keep."""
+        step = self.worlds.step(self._actions)
+        # An algorithm may keep the dicts of ended worlds, so these get new ones.
         for n in self._ended:
             self._infos[n] = {}
-        self._ended = []
-
-    def _fill_infos(
-        self, first: int, ended: Mask, truncated: Mask, info: dict[str, Any]
-    ) -> None:
-        """Fills in the infos of ended worlds of an env, the first of whose worlds is `first`."""
-        flags = {"TimeLimit.truncated": truncated}
-        for name in {"is_success", "collision"} & info["final_info"].keys():
-            values = info["final_info"][name]
-            flags[name] = values.reshape(len(ended), -1).all(axis=1)
-        for n in np.flatnonzero(ended).tolist():
-            self._ended.append(first + n)
-            known = {name: bool(values[n]) for name, values in flags.items()}
-            known["terminal_observation"] = info["final_obs"][n]
-            self._infos[first + n] = known
+        self._ended = step.endings.worlds.tolist()
+        endings = step.endings
+        for k, n in enumerate(self._ended):
+            info: dict[str, Any] = {
+                name: bool(flag[k]) for name, flag in endings.flags.items()
+            }
+            info["TimeLimit.truncated"] = bool(endings.truncated[k])
+            info["terminal_observation"] = endings.observations[k]
+            self._infos[n] = info
+        return step.observations, step.rewards, step.ended, list(self._infos)
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Reads an attribute of each world's vector env."""
@@ -157,10 +118,4 @@ class TrainVecEnv(VecEnv):
 
     def close(self) -> None:
         """Closes the vector envs."""
-        for env in self.envs:
-            env.close()
-
-
-def _join_rows(parts: Sequence[AnyArray]) -> AnyArray:
-    """Concatenates the rows of several envs; a single env's rows are returned unchanged."""
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+        self.worlds.close()

@@ -230,7 +230,7 @@ WRITTEN = (
         command=("policy", "info"),
     ),
     Loader(
-        "checkpoint.pt",
+        "checkpoint.npz",
         lambda path, version: write_bytes(path, _checkpoint_bytes(version)),
         _read_checkpoint,
     ),

@@ -179,7 +179,7 @@ def test_the_command_trains_on_a_cluster_and_leaves_what_training_on_one_machine
     assert done.exit_code == 0, done.output
     assert done.output.count("of 5 episodes") == 2
     names = {file.name.partition(".out")[0] for file in (out / "seed_0").iterdir()}
-    assert names == {"policy.onnx", "evaluation.json", "checkpoint.pt", "events"}
+    assert names == {"policy.onnx", "evaluation.json", "checkpoint.npz", "events"}
     refused = nics("--resume", "--out", out)
     assert refused.exit_code == 2
     assert "resume with the same --engine" in refused.output
