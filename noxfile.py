@@ -48,7 +48,7 @@ def ray(session: nox.Session) -> None:
     pins = (ROOT / "constraints-ray.txt").read_text(encoding="utf-8")
     # RLlib pins its own version of Gymnasium.
     constraints = write_constraints(session, left_out="gymnasium==", added=pins)
-    install(session, constraints, ".[deploy,distributed,test,train]")
+    install(session, constraints, ".[deploy,distributed,sb3,test,train]")
     tests = ["test/extras/ray/test_engine.py", "test/policy/test_train_vec_env.py"]
     session.run("pytest", *(session.posargs or tests))
 

@@ -60,6 +60,7 @@ HOMES = {
     "llvmlite": ("*kernels.py",),
     "mujoco": ("extras/mujoco/*",),
     "dartpy": ("extras/dart/*",),
+    "tensorboard": ("policy/train/*",),
     "torch": ("policy/train/*", "extras/ray/*"),
     "stable_baselines3": ("policy/train/*", "extras/ray/*"),
     "onnx": ("policy/*", "extras/foreign_policies/*"),

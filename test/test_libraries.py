@@ -115,7 +115,7 @@ assert nics("evaluate", "straight", "--episodes", "1", "--out", {str(tmp_path)!r
     [
         ("env.pettingzoo_env", "BridgeParallelEnv", "pettingzoo", "multi"),
         ("policy.train.export", "the export of a policy", "onnx", "deploy"),
-        ("policy.train.export", "the export of a policy", "torch", "train"),
+        ("policy.train.vec_env", "TrainVecEnv", "stable_baselines3", "sb3"),
         ("extras.dart", "DART", "dartpy", "dart"),
         ("extras.mujoco", "MuJoCo", "mujoco", "mujoco"),
     ],

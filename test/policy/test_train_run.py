@@ -55,9 +55,29 @@ def settings(tmp_path):
     return path
 
 
+@pytest.fixture
+def no_torch(monkeypatch):
+    """PyTorch and Stable-Baselines3 are not installed."""
+    for name in [*sys.modules]:
+        if name.endswith((".policy.train.sb3", ".policy.train.vec_env")):
+            monkeypatch.delitem(sys.modules, name)
+    for name in ("torch", "stable_baselines3"):
+        monkeypatch.setitem(sys.modules, name, None)
+
+
+def test_stable_baselines3_is_asked_for_by_the_name_of_its_extra(
+    tmp_path, settings, no_torch
+):
+    done = nics("--settings", settings, "--engine", "sb3", "--out", tmp_path / "run")
+    assert done.exit_code == 2
+    words = " ".join(done.output.split())
+    assert "pip install 'nics_drl_bridge[sb3]'" in words
+    assert not (tmp_path / "run" / "settings.yaml").exists()
+
+
 @pytest.mark.slow
 def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed(
-    tmp_path, settings
+    tmp_path, settings, no_torch
 ):
     out = tmp_path / "run"
     done = nics("--settings", settings, "--seeds", 3, 4, "--episodes", 10, "--out", out)
