@@ -17,7 +17,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.arrays import AnyArray, Singles
 from nics_drl_bridge.policy.train.progress import RECENT, TrainingLog, Watch
 from nics_drl_bridge.policy.train.settings import LEAST_RATE, TrainingSettings
-from nics_drl_bridge.policy.train.torch_networks import NormaliserLayer, to_tensors
+from nics_drl_bridge.policy.train.torch_parts import NormaliserLayer, to_tensors
 from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 from nics_drl_bridge.policy.train.worlds import COLLISION, TrainingWorlds
 
