@@ -50,9 +50,7 @@ def make_algorithm(name, env):
         if name == "lean":
             return make_actor(env, scale)
         torch.manual_seed(0)
-        outputs = gymnasium.spaces.flatdim(env.action_space)
-        made = network(size, outputs)
-        last = made[-1]
+        return network(size, gymnasium.spaces.flatdim(env.action_space))
     with torch.no_grad():
         last.weight.mul_(500.0)
     return made
