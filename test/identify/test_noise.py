@@ -85,8 +85,8 @@ def test_the_uncertainty_of_a_level_covers_its_error(differential):
 
 @pytest.mark.slow
 def test_noise_of_the_pose_is_no_drift_of_the_robot(differential):
-    recording = drive(differential, duration=60.0, noise=(0.005, 0.01))
-    found = fit_trial(recording, differential, order=1, train_until=20.0).noise
+    recording = drive(differential, duration=90.0, noise=(0.005, 0.01))
+    found = fit_trial(recording, differential, order=1, train_until=30.0).noise
     assert found.pose_position.std == pytest.approx(0.005, rel=TOLERANCE)
     assert found.pose_heading.std == pytest.approx(0.01, rel=TOLERANCE)
     assert found.position_drift.std < 0.003

@@ -89,6 +89,7 @@ def test_a_model_that_predicts_nothing_is_told_of_in_one_sentence(useless):
 
 @pytest.mark.slow
 def test_the_textbook_takes_the_place_of_a_useless_model(useless):
+    assert not useless.findings.replacement
     findings = prefer_textbook(useless.findings.whole, useless.findings)
     found = replace(useless, findings=findings, notes=findings.notes)
     found = replace(found, model=findings.model, held_out=findings.held_out)
