@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -176,6 +176,16 @@ def times(step: float = STEP_S, duration: float = DURATION_S) -> list[float]:
     return [float(t) for t in np.arange(0.0, duration, step)]
 
 
+def every(step: float, message: Callable[..., Any]) -> list[Row]:
+    """Messages of each time."""
+    return [(t, message(t)) for t in times(step)]
+
+
+def along(message: Callable[..., Any], step: float = STEP_S) -> list[Row]:
+    """Messages about where the car is."""
+    return every(step, lambda t: message(t, *place_at(t)))
+
+
 def commands(delay: float = 0.0) -> list[Row]:
     """Twists at 10 Hz."""
     return [(delay + t, twist(0.5, 0.0, 0.1)) for t in times(0.1)]
@@ -214,6 +224,12 @@ def write(
             for t, message in rows:
                 writer.write(connection, ns(t), store.serialize_cdr(message, kind))
     return path
+
+
+def storage_file(bag: Path) -> Path:
+    """The only file of a bag beside its metadata."""
+    (file,) = (p for p in bag.iterdir() if p.name != "metadata.yaml")
+    return file
 
 
 def unfinished_messages(folder: Path) -> int:

@@ -22,8 +22,7 @@ def test_what_the_package_computes_is_what_it_computed_before(name, monkeypatch)
     found = DIGESTS[name]()
     assert sorted(found) == sorted(kept)
     for part, values in found.items():
-        tolerance = TOLERANCES.get(part, TOLERANCES.get(name, BITS))
-        assert_alike(values, kept[part], tolerance, part)
+        assert_alike(values, kept[part], TOLERANCES.get(name, BITS), part)
 
 
 def assert_alike(found, kept, tolerance, part):

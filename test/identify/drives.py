@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from typing import Any
 
 import numpy as np
+import pytest
 from scipy.signal import cont2discrete, lfilter
 
 from nics_drl_bridge import geometry
@@ -22,6 +23,8 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 
 TICKS_PER_METRE = 70.0
 TRACK = 0.16
+SERVOED_LATENCY_S = 0.1
+PUSHED = {"throttle": (-0.3, 0.6), "steering": (-1.0, 1.0)}
 STEERED = {"speed_command": (-0.5, 1.2), "steering_command": (-1.1, 1.1)}
 # transfer functions
 MOTOR = ([1.0], [0.15, 1.0])
@@ -30,6 +33,8 @@ FINE_S = 0.002
 COMMAND_S = 0.02
 POSE_S = 0.01
 BASE = 0.9
+NOISE = 5e-4, 1e-3
+"""Of motion capture [m, rad]."""
 
 
 def drive(
@@ -85,73 +90,71 @@ def tricycle() -> RobotSpec:
     return build_robot(given | {"angular_is": "steering"}, STEERED)
 
 
-def front_driven(state: np.ndarray) -> np.ndarray:
-    speed, angle = state.T
-    return np.stack(
-        [speed * np.cos(angle), 0.0 * speed, speed * np.sin(angle) / BASE], axis=1
-    )
-
-
 def servoed(
-    twist=front_driven,
     seed: int = 0,
-    latency: float = 0.1,
     duration: float = 60.0,
-    mounting: tuple[float, float, float] = (0.25, 0.12, 0.5),
+    mounting: tuple[float, float, float] = (0.0, 0.0, 0.0),
     steering: float = 1.1,
-    noise: float = 5e-4,
     steering_servo=SERVO,
     dead: float = 0.0,
     later: float = 0.0,
     slew: float = np.inf,
-    motor=MOTOR,
 ) -> Recording:
-    """A drive of a robot with a motor and a servo, of which commands and poses were recorded.
+    """A drive of a tricycle with a motor and a servo, of which commands and poses were recorded.
 
     Args:
-        twist: the body twist of speed and steering angle.
         seed: of commands and noise.
-        latency: from a command's stamp to its effect [s].
         duration: [s].
         mounting: pose of the tracked body on the robot.
         steering: greatest angle [rad].
-        noise: of the position [m], and half of that of the heading [rad].
         steering_servo: transfer function.
         dead: speed that is told and does not come [m/s].
         later: by which the steering acts after the speed [s].
         slew: greatest acceleration that the robot's driver asks of its motor [m/s^2].
-        motor: transfer function.
     """
     rng = np.random.default_rng(seed)
     count = round(duration / FINE_S)
     per_hold = round(0.5 / FINE_S)
-    late = round(latency / FINE_S)
     ranges = np.array([STEERED["speed_command"], (-steering, steering)]).T
     command = np.repeat(rng.uniform(*ranges, (count // per_hold, 2)), per_hold, axis=0)
-    acting = np.concatenate([np.zeros((late, 2)), command[: count - late]])
-    if later:
-        acting[:, 1] = np.append(np.zeros(round(later / FINE_S)), acting[:, 1])[:count]
-    acting[:, 0] = np.sign(acting[:, 0]) * np.maximum(np.abs(acting[:, 0]) - dead, 0.0)
-    for k in range(1, count if np.isfinite(slew) else 1):
-        change = np.clip(acting[k, 0] - acting[k - 1, 0], -slew * FINE_S, slew * FINE_S)
-        acting[k, 0] = acting[k - 1, 0] + change
-    columns = []
-    for each, system in zip(acting.T, (motor, steering_servo), strict=True):
-        b, a, _ = cont2discrete(system, FINE_S)
-        columns.append(lfilter(b.ravel(), a, each))
-    moved = geometry.exp(twist(np.stack(columns, axis=1)) * FINE_S)
+    acting = delay(command, SERVOED_LATENCY_S)
+    acting[:, 1] = delay(acting[:, 1], later)
+    asked = np.sign(acting[:, 0]) * np.maximum(np.abs(acting[:, 0]) - dead, 0.0)
+    if np.isfinite(slew):
+        for k in range(1, count):
+            change = max(-slew * FINE_S, min(asked[k] - asked[k - 1], slew * FINE_S))
+            asked[k] = asked[k - 1] + change
+    speed = respond(asked, MOTOR)
+    angle = respond(acting[:, 1], steering_servo)
+    ahead = speed * np.cos(angle)
+    twist = np.stack([ahead, 0.0 * speed, speed * np.sin(angle) / BASE], axis=1)
+    poses = follow_twists(twist, FINE_S)[:: round(POSE_S / FINE_S)]
+    poses = geometry.compose(poses, np.array(mounting))
+    poses = poses + 5e-4 * rng.normal(size=poses.shape) * [1.0, 1.0, 2.0]
+    t = FINE_S * np.arange(count)
+    rows = slice(None, None, round(COMMAND_S / FINE_S))
+    pose = Stream(POSE_S * np.arange(len(poses)), poses)
+    return Recording(Stream(t[rows], command[rows]), pose)
+
+
+def delay(values: np.ndarray, seconds: float) -> np.ndarray:
+    """Returns values that come later, after zeros."""
+    late = round(seconds / FINE_S)
+    return np.concatenate([0.0 * values[:late], values[: len(values) - late]])
+
+
+def respond(values: np.ndarray, system) -> np.ndarray:
+    """Returns the response of a transfer function to values."""
+    b, a, _ = cont2discrete(system, FINE_S)
+    return lfilter(b.ravel(), a, values)
+
+
+def follow_twists(twist: np.ndarray, dt: float) -> np.ndarray:
+    """Returns the poses of a robot, from the origin on, before each of some body twists."""
+    moved = geometry.exp(twist * dt)
     heading = np.cumsum(moved[:, 2]) - moved[:, 2]
     step = geometry.rotate(moved[:, :2], heading)
-    path = np.concatenate([np.cumsum(step, axis=0) - step, heading[:, None]], axis=1)
-    rows = round(COMMAND_S / FINE_S)
-    poses = path[:: round(POSE_S / FINE_S)]
-    poses = geometry.compose(poses, np.array(mounting))
-    poses = poses + noise * rng.normal(size=poses.shape) * [1.0, 1.0, 2.0]
-    t = FINE_S * np.arange(count)
-    return Recording(
-        Stream(t[::rows], command[::rows]),
-        Stream(POSE_S * np.arange(len(poses)), poses),
-    )
+    return np.concatenate([np.cumsum(step, axis=0) - step, heading[:, None]], axis=1)
 
 
 def in_bursts(t: np.ndarray, period: float) -> np.ndarray:
@@ -160,16 +163,18 @@ def in_bursts(t: np.ndarray, period: float) -> np.ndarray:
     return polled + 1e-3 * (t - (polled - period))
 
 
-def with_wheels(recording: Recording, truth: Recording, swapped: bool) -> Recording:
-    """Adds wheel encoders of a car, counts per tick, on the robot's clock."""
-    state = truth.state
-    assert state is not None
-    speed = state.values[:, 0]
-    turn = state.values[:, 0] * np.tan(state.values[:, 1]) / 0.2
-    left = np.round(TICKS_PER_METRE * (speed - turn * TRACK / 2.0))
-    right = np.round(TICKS_PER_METRE * (speed + turn * TRACK / 2.0))
-    both = np.stack([right, left] if swapped else [left, right], axis=1)
-    return replace(recording, wheels=Stream(state.t[::2], both[::2], "robot"))
+def add_wheels(recording: Recording, ahead: float, swapped: bool = False) -> Recording:
+    """Adds wheel encoders by the motion of a pose at the centre, whose clock is then ahead [s]."""
+    pose = recording.pose
+    moved = geometry.log(geometry.between(pose.values[:-4], pose.values[4:]))
+    twist = moved / (pose.t[4:] - pose.t[:-4])[:, None]
+    both = twist[:, :1] + twist[:, 2:] * [-TRACK / 2.0, TRACK / 2.0]
+    both = np.round(
+        TICKS_PER_METRE * both[:, ::-1] if swapped else TICKS_PER_METRE * both
+    )
+    wheels = Stream(pose.t[2:-2:2], both[::2], "robot")
+    tracked = replace(pose, t=pose.t + ahead, clock="mocap")
+    return replace(recording, wheels=wheels, pose=tracked)
 
 
 def with_values(recording: Recording, **values: np.ndarray) -> Recording:
@@ -179,6 +184,13 @@ def with_values(recording: Recording, **values: np.ndarray) -> Recording:
         for name, each in values.items()
     }
     return replace(recording, **streams)
+
+
+def scale(recording: Recording, **factors: Any) -> Recording:
+    """Multiplies the columns of streams that are named."""
+    streams = recording.streams
+    scaled = {name: streams[name].values * each for name, each in factors.items()}
+    return with_values(recording, **scaled)
 
 
 def without(recording: Recording, start: float, end: float) -> Recording:
@@ -202,23 +214,25 @@ def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
     return replace(found.calibration, notes=collect_calibration_notes(found))
 
 
+def throttle_car() -> RobotSpec:
+    """A car by throttle, whose state is its twist."""
+    given = {"kind": "ackermann_throttle", "footprint_radius": 0.25}
+    return build_robot(given | {"parameters": {"wheelbase": 0.26}}, PUSHED)
+
+
 def slipping_car(
     seed: int = 0,
     duration: float = 40.0,
     dead: float = 0.1,
     friction: float = 0.3,
     drag: float = 0.15,
-    slip: float = 0.015,
-    mounting: tuple[float, float, float] = (0.08, 0, 0.1),
     throttle: float | None = None,
 ) -> tuple[RobotSpec, Recording]:
     """A car by throttle that slips aside and turns less at speed; only its poses were seen."""
-    limits = {"throttle": (-0.3, 0.6), "steering": (-1.0, 1.0)}
-    given = {"kind": "ackermann_throttle", "footprint_radius": 0.25}
-    spec = build_robot(given | {"parameters": {"wheelbase": 0.26}}, limits)
     rng = np.random.default_rng(seed)
     count = round(duration / COMMAND_S)
-    draws = rng.uniform(*np.array(list(limits.values())).T, (count // 40 + 1, 2))
+    limits = np.array(list(PUSHED.values())).T
+    draws = rng.uniform(*limits, (count // 40 + 1, 2))
     command = np.repeat(
         np.where(rng.random(draws.shape) < 0.15, 0.0, draws), 40, axis=0
     )[:count]
@@ -231,7 +245,7 @@ def slipping_car(
         x, y, heading, v, angle, turn = state
         push = 9.0 * np.sign(u) * max(abs(u) - dead, 0.0) - 0.5 * v - drag * v * abs(v)
         wanted = v * np.tan(angle) / (0.26 + 0.03 * v * v)
-        aside = -slip * v * v * turn
+        aside = -0.015 * v * v * turn
         c = np.cos(heading)
         s = np.sin(heading)
         v += FINE_S * push
@@ -246,12 +260,11 @@ def slipping_car(
                 turn + FINE_S * (wanted - turn) / 0.04,
             ]
         )
-    pose = geometry.compose(np.array(poses), np.array(mounting, np.float64))[::5]
+    pose = geometry.compose(np.array(poses), np.array([0.08, 0.0, 0.1]))[::5]
     pose = pose + 0.0003 * rng.normal(size=pose.shape)
     t = FINE_S * 5.0 * np.arange(len(pose))
-    return spec, Recording(
-        Stream(COMMAND_S * np.arange(count), command), Stream(t, pose)
-    )
+    commands = Stream(COMMAND_S * np.arange(count), command)
+    return throttle_car(), Recording(commands, Stream(t, pose))
 
 
 def make_model(
@@ -307,11 +320,7 @@ def follow_commands(
     for goal in goals:
         states.append(goal + (state - goal) * kept)
         state = goal + (state - goal) * np.exp(-dt / lag)
-    moved = geometry.exp(twist(np.concatenate(states)) * dt / fine)
-    heading = np.cumsum(moved[:, 2]) - moved[:, 2]
-    step = geometry.rotate(moved[:, :2], heading)
-    path = np.concatenate([np.cumsum(step, axis=0) - step, heading[:, None]], axis=1)
-    poses = path[::fine]
+    poses = follow_twists(twist(np.concatenate(states)), dt / fine)[::fine]
     rng = np.random.default_rng(seed)
     poses = poses + rng.normal(size=poses.shape) * [noise[0], *noise]
     t = dt * np.arange(len(commands))
@@ -331,7 +340,13 @@ def draw_commands(
     return np.repeat(held, hold, axis=0)[:count]
 
 
-@cache
-def identify_servoed() -> Identified:
-    """A model of the usual drive of a robot with a motor and a servo, for several tests."""
-    return stages.identify(servoed(), tricycle(), alpha="auto")
+def fit_trial(recording: Recording, spec: RobotSpec, **settings: Any) -> Identified:
+    """A model of the first two thirds of a drive, judged on the rest; it is not refitted."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stages, "refit_model", lambda drive, findings: findings)
+        return stages.identify(recording, spec, **settings)
+
+
+def fit_whole(recording: Recording, spec: RobotSpec, **settings: Any) -> Identified:
+    """A model of a whole drive, which no rest is left to judge."""
+    return stages.identify(recording, spec, train_until=np.inf, **settings)

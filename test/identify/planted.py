@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.signal import lfilter
 
-from identify.drives import with_values
+from identify.drives import follow_twists, scale, with_values
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec, build_robot
 
@@ -30,26 +31,16 @@ def held_values(
 
 
 def with_pose(
-    recording: Recording,
-    values: np.ndarray,
-    t: np.ndarray | None = None,
-    clock: str = "robot",
+    recording: Recording, values: np.ndarray, t: np.ndarray | None = None
 ) -> Recording:
     """Returns a recording with other poses."""
     stamps = recording.pose.t if t is None else t
-    return replace(recording, pose=Stream(stamps, values, clock))
+    return replace(recording, pose=Stream(stamps, values, "robot"))
 
 
-def scaled_pose(x: float = 1.0, y: float = 1.0, heading: float = 1.0) -> Defect:
-    """Multiplies the columns of the pose."""
-    return lambda drive: with_pose(drive, drive.pose.values * np.array([x, y, heading]))
-
-
-def scaled_command(speed: float = 1.0, steering: float = 1.0) -> Defect:
-    """Multiplies the columns of the command."""
-    return lambda drive: with_values(
-        drive, command=drive.command.values * np.array([speed, steering])
-    )
+def scaled(**factors: Sequence[float]) -> Defect:
+    """Multiplies the columns of streams."""
+    return lambda drive: scale(drive, **factors)
 
 
 def swapped_axes(drive: Recording) -> Recording:
@@ -62,17 +53,10 @@ def swapped_commands(drive: Recording) -> Recording:
     return with_values(drive, command=drive.command.values[:, ::-1])
 
 
-def ahead(seconds: float, clock: str = "robot") -> Defect:
-    """Stamps the poses by a clock that is ahead; that it is another one is told if it is named."""
+def stamped(ahead_s: float, rate: float = 1.0) -> Defect:
+    """Stamps the poses by a clock that is ahead, or runs faster."""
     return lambda drive: with_pose(
-        drive, drive.pose.values, drive.pose.t + seconds, clock
-    )
-
-
-def drifting(share: float) -> Defect:
-    """Stamps the poses by a clock that runs faster by a share."""
-    return lambda drive: with_pose(
-        drive, drive.pose.values, drive.pose.t * (1.0 + share)
+        drive, drive.pose.values, drive.pose.t * rate + ahead_s
     )
 
 
@@ -100,13 +84,6 @@ def gap(start: float, end: float) -> Defect:
         return with_pose(drive, drive.pose.values[keep], drive.pose.t[keep])
 
     return lost
-
-
-def duplicated_rows(drive: Recording) -> Recording:
-    """Writes every row of the poses twice."""
-    return with_pose(
-        drive, np.repeat(drive.pose.values, 2, axis=0), np.repeat(drive.pose.t, 2)
-    )
 
 
 TRACK_M = 0.3
@@ -149,51 +126,28 @@ def wheeled() -> RobotSpec:
     return build_robot(given, {})
 
 
-def rounded(values: np.ndarray, low: float, high: float, levels: int) -> np.ndarray:
-    """Rounds values to so many levels from the least to the greatest."""
-    step = (high - low) / (levels - 1)
-    return low + step * np.round((values - low) / step)
-
-
-def wheeled_drive(seed: int = 0, duration: float = 60.0, levels: int = 0) -> Recording:
-    """A drive of the robot with two wheels, without a defect.
-
-    Its commands take so many `levels`, or any value if that is 0.
-    """
-    rng = np.random.default_rng(seed)
+def wheeled_drive(duration: float = 60.0, two_values: bool = False) -> Recording:
+    """A drive of the robot with two wheels, without a defect; its commands may take two values."""
+    rng = np.random.default_rng(0)
     count = round(duration / STEP_S)
     speed = held_values(rng, -0.5, 1.0, count, round(0.9 / STEP_S))
     turn = held_values(rng, -1.5, 1.5, count, round(0.7 / STEP_S))
-    if levels:
-        speed = rounded(speed, -0.5, 1.0, levels)
-        turn = rounded(turn, -1.5, 1.5, levels)
     command = np.stack([speed, turn], axis=1)
-    if not levels:
+    if two_values:
+        command = np.where(command > [0.25, 0.0], [1.0, 1.5], [-0.5, -1.5])
+    else:
         command[: round(1.0 / STEP_S)] = 0.0
     told = round(COMMAND_S / STEP_S)
     command = np.repeat(command[::told], told, axis=0)[:count]
     late = round(LATENCY_S / STEP_S)
-    acting = np.concatenate([np.zeros((late, 2)), command[: count - late]])
-    wheels = np.zeros((count, 2))
-    poses = np.zeros((count, 3))
-    x = y = heading = left = right = 0.0
-    for k, (forward, around) in enumerate(acting):
-        poses[k] = x, y, heading
-        wheels[k] = left, right
-        rolling = WHEEL_RADIUS_M * (left + right) / 2.0
-        x += STEP_S * rolling * np.cos(heading)
-        y += STEP_S * rolling * np.sin(heading)
-        heading += STEP_S * WHEEL_RADIUS_M * (right - left) / TRACK_M
-        left += (
-            STEP_S
-            * ((forward - around * TRACK_M / 2.0) / WHEEL_RADIUS_M - left)
-            / WHEEL_LAG_S
-        )
-        right += (
-            STEP_S
-            * ((forward + around * TRACK_M / 2.0) / WHEEL_RADIUS_M - right)
-            / WHEEL_LAG_S
-        )
+    forward, around = np.vstack([np.zeros((late, 2)), command[: count - late]]).T
+    apart = around * TRACK_M / 2.0
+    asked = np.stack([forward - apart, forward + apart], axis=1) / WHEEL_RADIUS_M
+    share = STEP_S / WHEEL_LAG_S
+    wheels = lfilter([0.0, share], [1.0, share - 1.0], asked, axis=0)
+    left, right = WHEEL_RADIUS_M * wheels.T
+    twist = [(left + right) / 2.0, 0.0 * left, (right - left) / TRACK_M]
+    poses = follow_twists(np.stack(twist, axis=1), STEP_S)
     rows = round(POSE_S / STEP_S)
     noise = np.array([POSITION_NOISE_M, POSITION_NOISE_M, HEADING_NOISE_RAD])
     poses = poses[::rows] + noise * rng.normal(size=(len(poses[::rows]), 3))
@@ -204,14 +158,3 @@ def wheeled_drive(seed: int = 0, duration: float = 60.0, levels: int = 0) -> Rec
         state=Stream(t[::rows], wheels[::rows]),
         source="planted drive",
     )
-
-
-def scaled_wheels(left: float = 1.0, right: float = 1.0) -> Defect:
-    """Multiplies the speeds of the wheels, as of encoders that count backwards."""
-
-    def scaled(drive: Recording) -> Recording:
-        assert drive.state is not None
-        values = drive.state.values * np.array([left, right])
-        return with_values(drive, state=values)
-
-    return scaled

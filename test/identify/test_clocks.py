@@ -6,41 +6,12 @@ from dataclasses import replace
 
 import pytest
 
-from identify.drives import MOTOR, drive, identify_servoed, servoed, tricycle
+from identify.drives import drive, fit_whole
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import SEPARABLE_S, measure_timing
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.verdict import describe_clocks
-
-SUM = "command_latency_and_speed_lag_s"
-
-
-@pytest.mark.slow
-def test_a_servo_of_second_order_is_not_taken_for_latency():
-    found = identify_servoed().calibration
-    assert found.command_latency_s == pytest.approx(0.1, abs=0.003)
-    assert found.uncertainty["command_latency_s"] < SEPARABLE_S
-    speed, steering = found.responses
-    assert speed.lag_s == pytest.approx(0.15, abs=0.005)
-    (curve,) = found.inputs  # a part of its lag looks like a delay
-    assert (curve.command, curve.bends) == (steering.command, False)
-    total = curve.delay + steering.lag_s
-    assert total == pytest.approx(22.0 / 180.0, abs=0.015)  # damping by stiffness
-    assert SUM not in found.uncertainty
-
-
-@pytest.mark.slow
-def test_a_command_that_acts_later_than_the_others_has_a_delay():
-    recording = servoed(steering_servo=MOTOR, later=0.12)
-    found = identify(recording, tricycle()).calibration
-    assert found.command_latency_s == pytest.approx(0.1, abs=0.003)
-    (curve,) = found.inputs
-    assert curve.command == "steering_command"
-    assert curve.delay == pytest.approx(0.12, abs=0.005)
-    assert abs(curve.delay - 0.12) < 3.0 * found.uncertainty["steering_command.delay"]
-    assert [r.lag_s for r in found.responses] == pytest.approx([0.15, 0.15], abs=0.01)
 
 
 @pytest.mark.slow
@@ -48,9 +19,9 @@ def test_of_latency_and_lag_that_noise_hides_the_sum_is_told(car):
     recording = drive(
         car, 4, 20.0, latency=0.05, noise=(0.04, 0.08), measured_state=False
     )
-    found = identify(recording, car).calibration
+    found = fit_whole(recording, car).calibration
     assert found.uncertainty["command_latency_s"] > SEPARABLE_S
-    sigma = found.uncertainty[SUM]
+    sigma = found.uncertainty["command_latency_and_speed_lag_s"]
     both = found.command_latency_s + found.responses[0].lag_s
     assert both == pytest.approx(0.15, abs=3.0 * sigma)
     assert any(

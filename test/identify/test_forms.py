@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from identify.drives import make_model, slipping_car
+from identify.drives import make_model, slipping_car, throttle_car
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.findings import Findings, resample_drive
 from nics_drl_bridge.identify.forms import (
@@ -34,7 +34,7 @@ from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-MOTION = Library(slipping_car(duration=4.0)[0], Kind.MOTION, True, 1.0, 3)
+MOTION = Library(throttle_car(), Kind.MOTION, True, 1.0, 3)
 CURVE = InputCurve(command="throttle", dead=0.05, least=-0.3, most=0.5)
 
 
@@ -192,7 +192,7 @@ def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, sample
 
 
 def test_the_dead_zone_of_a_steering_is_none_of_the_drive():
-    spec, _ = slipping_car(duration=1.0)
+    spec = throttle_car()
     inputs = (
         InputCurve(command="throttle", dead=0.1),
         InputCurve(command="steering", dead=0.3),

@@ -1,17 +1,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 
-from identify.drives import drive, make_model, with_values
+from identify.drives import NOISE, drive, fit_trial, make_model, scale, with_values
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.identify import Identified, cut, identify
+from nics_drl_bridge.identify.drive import Drive, Settings
+from nics_drl_bridge.identify.findings import Findings
+from nics_drl_bridge.identify.identify import (
+    STAGES,
+    complete_model,
+    cut,
+    identify,
+    judge_model,
+    run,
+)
 from nics_drl_bridge.identify.open_loop import predict, select_windows
 from nics_drl_bridge.identify.textbook_model import assume_textbook
+from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.spec import RobotSpec, build_robot, load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -20,26 +28,32 @@ def term(model, dof: str, name: str) -> float:
     return model.named.terms[dof].get(name, 0.0)
 
 
-@cache
-def noisy() -> Identified:
-    """A model of a noisy drive whose state was not measured."""
-    car = load_robot("ackermann")
-    return identify(drive(car, noise=(5e-4, 1e-3), measured_state=False), car)
+def learn(recording: Recording, order: int | str = 2) -> tuple[Drive, Findings]:
+    """A drive of a car, and findings on its first 16 s before they are completed or judged."""
+    settings = Settings(order=order, train_until_s=16.0)
+    whole = replace(Drive(recording, load_robot("ackermann")), settings=settings)
+    return whole, run(STAGES[: STAGES.index(complete_model)], whole)
 
 
-@cache
-def held(angle: float, assume: bool) -> Identified:
-    """A model of such a drive with the steering held, completed by the textbook or not."""
-    car = load_robot("ackermann")
+def drive_noisily(spec: RobotSpec) -> Recording:
+    """A noisy drive whose state was not measured."""
+    return drive(spec, duration=24.0, noise=NOISE, measured_state=False)
+
+
+@pytest.fixture(scope="module")
+def noisy(car) -> Findings:
+    return learn(drive_noisily(car))[1]
+
+
+@pytest.fixture(scope="module")
+def held(car) -> tuple[Drive, Findings]:
+    """A noisy drive with the steering held at -0.4, and findings on it."""
     data = car.model_dump()
-    data["command"][1].update(min=angle - 1e-9, max=angle + 1e-9)
-    recording = drive(
-        RobotSpec.model_validate(data), noise=(5e-4, 1e-3), measured_state=False
-    )
+    data["command"][1].update(min=-0.4 - 1e-9, max=-0.4 + 1e-9)
+    recording = drive_noisily(RobotSpec.model_validate(data))
     values = recording.command.values.copy()
-    values[:, 1] = angle
-    held = with_values(recording, command=values)
-    return identify(held, car, assume=assume)
+    values[:, 1] = -0.4
+    return learn(with_values(recording, command=values), "auto")
 
 
 def test_an_exact_recording_is_fitted_to_nine_digits_and_not_refined(differential):
@@ -54,42 +68,42 @@ def test_an_exact_recording_is_fitted_to_nine_digits_and_not_refined(differentia
 
 
 @pytest.mark.slow
-def test_the_held_out_part_is_not_used_for_the_model(car):
-    recording = drive(car, noise=(5e-4, 1e-3), measured_state=False)
-    spoiled = recording.pose.values.copy()
-    spoiled[recording.pose.t > 26.7, :2] *= 1.5
-    other = with_values(recording, pose=spoiled)
-    a = noisy().trial
-    b = identify(other, car).trial
-    assert np.array_equal(a.model.coefficients, b.model.coefficients)
-    assert a.calibration == b.calibration
+def test_the_held_out_part_is_not_used_for_the_model(car, noisy):
+    plain = drive_noisily(car)
+    late = plain.pose.t > 16.0
+    factors = np.where(late[:, None], [1.5, 1.5, 1.0], 1.0)
+    _, other = learn(scale(plain, pose=factors))
+    assert np.array_equal(other.model.coefficients, noisy.model.coefficients)
+    assert other.calibration == noisy.calibration
 
 
 @pytest.mark.slow
-def test_a_prediction_knows_no_pose_after_its_start(car):
-    found = noisy()
-    recording = noisy().recording
-    chosen = select_windows(found.drive, found.calibration, 30.0, 36.0, 5.0, 0.1)
-    values = recording.pose.values.copy()
-    values[recording.pose.t > chosen.start_t[-1]] = 7.0
-    blind = Drive(with_values(recording, pose=values), car)
-    seen = predict(found.model, found.calibration, found.drive, chosen)
-    assert np.array_equal(seen, predict(found.model, found.calibration, blind, chosen))
+def test_a_prediction_knows_no_pose_after_its_start(car, noisy):
+    whole = noisy.whole
+    chosen = select_windows(whole, noisy.calibration, 17.0, 23.0, 5.0, 0.1)
+    values = whole.recording.pose.values.copy()
+    values[whole.recording.pose.t > chosen.start_t[-1]] = 7.0
+    blind = Drive(with_values(whole.recording, pose=values), car)
+    seen, unseen = (
+        predict(noisy.model, noisy.calibration, each, chosen) for each in (whole, blind)
+    )
+    assert np.array_equal(seen, unseen)
 
 
 @pytest.mark.slow
 def test_a_noisy_drive_in_bursts_without_state_still_gives_the_textbook_terms(car):
     recording = drive(
         car,
+        duration=30.0,
         latency=0.06,
         pose_clock_ahead=0.4,
         rotation=-1.2,
         lever=(0.05, 0.02),
-        noise=(5e-4, 1e-3),
+        noise=NOISE,
         burst=0.1,
         measured_state=False,
     )
-    found = identify(recording, car)
+    found = fit_trial(recording, car)
     assert term(found.model, "vx", "speed") == 1.0
     assert term(found.model, "wz", "speed*steering") == pytest.approx(5.2, abs=0.3)
     assert found.model.terms_kept <= 8
@@ -104,33 +118,34 @@ def test_a_short_drive_says_that_it_was_not_tried(car):
 
 
 @pytest.mark.slow
-def test_steering_that_never_moved_has_no_terms_and_a_sentence():
-    found = held(-0.4, assume=False)
-    used = found.model.powers[:, [1, 3]]
-    assert (used == 0).all()
-    assert found.fit.unmoved == ("steering", "steering_command")
-    assert any("drive with steering_command changing" in note for note in found.notes)
+def test_steering_that_never_moved_has_no_terms_and_a_sentence(held):
+    whole, found = held
+    found = run((judge_model,), whole, found)
+    assert not found.model.powers[:, [1, 3]].any()
+    assert found.pruned_fit.unmoved == ("steering", "steering_command")
+    assert "drive with steering_command changing" in " ".join(found.notes)
     assert found.model.assumed == ()
 
 
 @pytest.mark.slow
-def test_on_request_the_textbook_completes_what_was_measured_at_a_constant():
-    plain = held(-0.4, assume=False)
-    completed = held(-0.4, assume=True)
+def test_on_request_the_textbook_completes_what_was_measured_at_a_constant(held):
+    whole, plain = held
+    whole = replace(whole, settings=replace(whole.settings, assume=True))
+    found = run((complete_model, judge_model), whole, plain)
     learnt = term(plain.model, "wz", "speed")
-    assert term(completed.model, "wz", "speed*steering") == pytest.approx(learnt / -0.4)
-    assert ("wz", "speed*steering") in completed.model.assumed
-    assert term(completed.model, "d_steering", "steering_command") > 0.0
-    assert any(note.startswith("Assumed, not learnt: wz") for note in completed.notes)
+    assert term(found.model, "wz", "speed*steering") == pytest.approx(learnt / -0.4)
+    assert ("wz", "speed*steering") in found.model.assumed
+    assert term(found.model, "d_steering", "steering_command") > 0.0
+    assert any(note.startswith("Assumed, not learnt: wz") for note in found.notes)
 
 
-@pytest.mark.slow
-def test_at_zero_steering_the_parameters_of_the_spec_are_assumed():
-    found = held(0.0, assume=True)
-    assert term(found.model, "wz", "speed*steering") == pytest.approx(
-        1.0 / 0.2, rel=1e-3
-    )
-    assert any("from the parameters" in note for note in found.notes)
+def test_at_zero_steering_the_parameters_of_the_spec_are_assumed(car):
+    still = np.zeros(4)
+    straight = make_model(car, {"vx": {"speed": 1.0}}, low=still, high=still)
+    found, notes = assume_textbook(straight, car, ("steering", "steering_command"))
+    turned = term(found, "wz", "speed*steering")
+    assert turned == pytest.approx(1.0 / 0.2, rel=1e-3)
+    assert "from the parameters" in " ".join(notes)
 
 
 @pytest.mark.parametrize("until", [0.0, -3.0])

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from identify.drives import draw_commands, follow_commands
+from identify.drives import draw_commands, fit_trial, follow_commands
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.generator import generate, mount_lidar
 from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.identify import identify, join_recordings
+from nics_drl_bridge.identify.identify import join_recordings
 from nics_drl_bridge.identify.report import conclude, format_report
 from nics_drl_bridge.identify.shooting import Parameters, Shooting
 from nics_drl_bridge.identify.verdict import (
@@ -70,7 +70,9 @@ def test_the_time_between_two_recordings_is_no_gap_in_the_pose():
 
 @pytest.fixture(scope="module")
 def together():
-    return generate([STRAIGHT, TURNING], ROBOT, mount_lidar(ROBOT), (), strict=True)
+    return generate(
+        [STRAIGHT, TURNING], ROBOT, mount_lidar(ROBOT), order=1, strict=True
+    )
 
 
 @pytest.mark.slow
@@ -111,9 +113,9 @@ def test_not_even_episodes_without_a_gap_are_crossed():
 @pytest.mark.slow
 def test_two_drives_teach_together_what_neither_does_alone(together):
     with pytest.raises(FitError):
-        generate(STRAIGHT, ROBOT, mount_lidar(ROBOT), (), strict=True)
+        generate(STRAIGHT, ROBOT, mount_lidar(ROBOT), order=1, strict=True)
     with pytest.raises(FitError):
-        generate(TURNING, ROBOT, mount_lidar(ROBOT), (), strict=True)
+        generate(TURNING, ROBOT, mount_lidar(ROBOT), order=1, strict=True)
     model, identified = together
     last = identified.judgement[-1]
     assert last.model.position_m < 0.02
@@ -140,7 +142,7 @@ def test_clocks_of_their_own_are_aligned_drive_by_drive():
     ]
     assert np.abs(lags).max() < 0.3
     assert lags[0] == pytest.approx(lags[1], abs=0.03)
-    found = identify(joined, ROBOT)
+    found = fit_trial(joined, ROBOT, order=1)
     assert found.judgement[-1].model.position_m < 0.05
 
 
@@ -148,7 +150,7 @@ def test_clocks_of_their_own_are_aligned_drive_by_drive():
 def test_a_recording_that_alone_is_off_is_named():
     good = [driven(f"good{k}.csv", 0.8, 1.5, seed=k) for k in range(2)]
     slippery = driven("slippery.csv", 0.8, 1.5, seed=5, gain=np.array([0.5, 0.4]))
-    found = identify(join_recordings([*good, slippery], ROBOT), ROBOT)
+    found = fit_trial(join_recordings([*good, slippery], ROBOT), ROBOT, order=1)
     named = [note for note in found.notes if isinstance(note, Alone)]
     assert len(named) == 1
     assert named[0].startswith("slippery.csv alone is off: its predictions end")

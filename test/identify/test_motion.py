@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from identify.drives import slipping_car
+from identify.drives import fit_trial, slipping_car
 from nics_drl_bridge.identify.calibration import (
     WIDTHS_S,
     Calibration,
@@ -23,7 +23,6 @@ from nics_drl_bridge.identify.calibration import (
     smooth_commands,
 )
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import build_robot, load_robot
@@ -140,7 +139,7 @@ def test_poses_ten_times_a_second_do_not_hide_when_a_robot_got_its_commands():
         replace(s, t=s.t[::5], values=s.values[::5])
         for s in (drive.command, drive.pose)
     ]
-    found = identify(Recording(*seen, source="ten a second"), spec)
+    found = fit_trial(Recording(*seen, source="ten a second"), spec, order=1)
     assert found.calibration.command_latency_s == pytest.approx(0.0, abs=0.03)
     ends = found.judgement[-1]
     assert ends.model.position_m < 0.02 * ends.path_m

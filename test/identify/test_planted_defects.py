@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from identify import planted
+from identify.drives import fit_trial
+from nics_drl_bridge import generator
 from nics_drl_bridge.errors import BridgeError
-from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.identify import Identified, refit_model
 from nics_drl_bridge.identify.report import conclude, explain_uselessness, format_report
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -39,144 +39,117 @@ CAUSES = {
 """What statements blame, by what they say."""
 
 
-def without_wheels(spec: RobotSpec) -> RobotSpec:
-    """Returns the robot with two wheels if neither wheel is recorded."""
-    return spec.model_copy(update={"state": ()})
-
-
-def statements(recording: Recording, spec: RobotSpec) -> str:
+def describe(recording: Recording, spec: RobotSpec) -> str:
     """Everything that is said of a drive."""
     try:
-        found = identify(recording, spec, alpha="auto")
+        return describe_fit(fit_trial(recording, spec, alpha="auto"))
     except BridgeError as error:
         return str(error)
+
+
+def describe_fit(found: Identified) -> str:
+    """Everything that is said of a fit."""
     told = [*conclude(found).lines, *found.notes, explain_uselessness(found)]
     return " ".join(" ".join([*told, format_report("here", found)]).split())
 
 
-def blamed(text: str) -> set[str]:
+def find_causes(text: str) -> set[str]:
     """Returns the causes that a text names."""
     return {cause for cause, pattern in CAUSES.items() if re.search(pattern, text)}
 
 
-def same(drive: Recording) -> Recording:
-    return drive
-
-
-def without_state(defect: planted.Defect) -> planted.Defect:
-    return lambda drive: replace(defect(drive), state=None)
-
-
-# Defects that are found as another one is, and drives much like another.
-ALIKE = {
-    "x points backwards",
-    "heading in degrees",
-    "speed at a third",
-    "both encoders backwards",
-    "15 values",
-    "a long drive",
-    "rows twice",
-}
-ALIKE_WITHOUT_STATE = {"pose in feet", "speed in km/h", "turn to the other side"}
-
-
-def some_of(cases: dict[str, Any], alike: Collection[str] = ALIKE) -> list[Any]:
-    """The names of cases; those that resemble others run in the campaign."""
-    return [
-        pytest.param(name, marks=pytest.mark.campaign) if name in alike else name
-        for name in cases
-    ]
-
-
-SOUND = set[str]()
-MEASURED: dict[str, tuple[planted.Defect, set[str]]] = {
-    "nothing": (same, SOUND),
+DEFECTS: dict[str, tuple[planted.Defect, str]] = {
+    "nothing": (lambda drive: drive, ""),
     "heading counts clockwise": (
-        planted.scaled_pose(heading=-1.0),
-        {"an axis is reversed"},
+        planted.scaled(pose=[1.0, 1.0, -1.0]),
+        "an axis is reversed",
     ),
-    "x points backwards": (planted.scaled_pose(x=-1.0), {"an axis is reversed"}),
-    "x and y exchanged": (planted.swapped_axes, {"an axis is reversed"}),
-    "pose in millimetres": (planted.scaled_pose(x=1e3, y=1e3), {"a unit is wrong"}),
-    "pose in feet": (planted.scaled_pose(x=3.28, y=3.28), {"a scale is wrong"}),
-    "heading in degrees": (
-        planted.scaled_pose(heading=180.0 / np.pi),
-        {"a unit is wrong"},
-    ),
-    "turn in degrees": (
-        planted.scaled_command(steering=180.0 / np.pi),
-        {"a unit is wrong"},
-    ),
-    "speed at a third": (planted.scaled_command(speed=0.3), {"a scale is wrong"}),
+    "x and y exchanged": (planted.swapped_axes, "an axis is reversed"),
+    "pose in millimetres": (planted.scaled(pose=[1e3, 1e3, 1.0]), "a unit is wrong"),
+    "pose in feet": (planted.scaled(pose=[3.28, 3.28, 1.0]), "a scale is wrong"),
+    "turn in degrees": (planted.scaled(command=[1.0, 57.3]), "a unit is wrong"),
     "turn to the other side": (
-        planted.scaled_command(steering=-1.0),
-        {"the turn has the wrong sign"},
+        planted.scaled(command=[1.0, -1.0]),
+        "the turn has the wrong sign",
     ),
     "speed backwards": (
-        planted.scaled_command(speed=-1.0),
-        {"the speed has the wrong sign"},
+        planted.scaled(command=[-1.0, 1.0]),
+        "the speed has the wrong sign",
     ),
-    "commands exchanged": (planted.swapped_commands, {"commands are swapped"}),
+    "commands exchanged": (planted.swapped_commands, "commands are swapped"),
     "left encoder backwards": (
-        planted.scaled_wheels(left=-1.0),
-        {"an encoder counts backwards"},
+        planted.scaled(state=[-1.0, 1.0]),
+        "an encoder counts backwards",
     ),
-    "both encoders backwards": (
-        planted.scaled_wheels(left=-1.0, right=-1.0),
-        {"an encoder counts backwards"},
-    ),
-    "pose frozen": (planted.frozen_pose, {"the pose is frozen"}),
-    "a jump": (planted.jump(25.0, 2.0), {"the pose jumps"}),
-    "a gap": (planted.gap(20.0, 26.0), {"the pose has a gap"}),
-    "rows twice": (planted.duplicated_rows, {"rows are repeated"}),
+    "pose frozen": (planted.frozen_pose, "the pose is frozen"),
+    "a jump": (planted.jump(20.0, 2.0), "the pose jumps"),
+    "a gap": (planted.gap(16.0, 22.0), "the pose has a gap"),
+    "2 values": (lambda _: planted.wheeled_drive(two_values=True), "two values"),
+    "12 s": (lambda _: planted.wheeled_drive(duration=12.0), "the drive is too short"),
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", some_of(MEASURED))
+@pytest.mark.parametrize("name", DEFECTS)
 def test_a_defect_is_named_and_no_other(name):
-    defect, causes = MEASURED[name]
-    text = statements(defect(planted.wheeled_drive()), planted.wheeled())
-    assert blamed(text) == causes, text
+    defect, cause = DEFECTS[name]
+    text = describe(defect(planted.wheeled_drive(duration=45.0)), planted.wheeled())
+    assert find_causes(text) == {cause} - {""}, text
 
 
-COMMANDED: dict[str, tuple[planted.Defect, set[str]]] = {
-    "nothing": (same, SOUND),
-    "pose stamped too early": (planted.ahead(-0.5), {"another clock"}),
-    "the pose's clock runs faster": (planted.drifting(0.01), {"the clocks drift"}),
-    "pose in feet": (planted.scaled_pose(x=3.28, y=3.28), {"a scale is wrong"}),
-    "speed in km/h": (planted.scaled_command(speed=3.6), {"a unit is wrong"}),
-    "pose frozen": (planted.frozen_pose, {"the pose is frozen"}),
-    "turn to the other side": (
-        planted.scaled_command(steering=-1.0),
-        {"the turn has the wrong sign"},
-    ),
-}
+def without_wheels() -> RobotSpec:
+    """The robot with two wheels, of which neither wheel is recorded."""
+    return planted.wheeled().model_copy(update={"state": ()})
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", some_of(COMMANDED, ALIKE_WITHOUT_STATE))
-def test_a_defect_is_named_where_only_commands_and_poses_are_known(name):
-    defect, causes = COMMANDED[name]
-    drive = without_state(defect)(planted.wheeled_drive())
-    text = statements(drive, without_wheels(planted.wheeled()))
-    assert blamed(text) == causes, text
+@pytest.mark.parametrize(
+    ("defect", "cause"),
+    [
+        (planted.stamped(-0.5), "another clock"),
+        (planted.stamped(0.0, 1.01), "the clocks drift"),
+    ],
+)
+def test_a_clock_is_named_where_only_commands_and_poses_are_known(defect, cause):
+    drive = replace(defect(planted.wheeled_drive()), state=None)
+    text = describe(drive, without_wheels())
+    assert find_causes(text) == {cause}, text
 
 
-DRIVES: dict[str, tuple[Callable[[], Recording], set[str]]] = {
-    "15 values": (lambda: planted.wheeled_drive(levels=15), SOUND),
-    "2 values": (lambda: planted.wheeled_drive(levels=2), {"two values"}),
-    "a short drive": (
-        lambda: planted.wheeled_drive(duration=12.0),
-        {"the drive is too short"},
-    ),
-    "a long drive": (lambda: planted.wheeled_drive(duration=267.0), SOUND),
-}
+@pytest.fixture(scope="module")
+def commanded() -> Identified:
+    """A fit to a drive without a defect, of which only commands and poses are known."""
+    recording = replace(planted.wheeled_drive(), state=None)
+    return fit_trial(recording, without_wheels(), alpha="auto")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", some_of(DRIVES))
-def test_a_drive_is_told_what_it_is(name):
-    make, causes = DRIVES[name]
-    text = statements(make(), planted.wheeled())
-    assert blamed(text) == causes, text
+def test_no_defect_is_named_where_there_is_none(commanded):
+    text = describe_fit(commanded)
+    assert not find_causes(text), text
+
+
+@pytest.mark.slow
+def test_a_model_that_loses_to_its_textbook_is_not_written_but_the_textbook(
+    commanded, tmp_path, monkeypatch
+):
+    assert commanded.findings.replacement
+    doubts = " ".join(conclude(commanded).doubts)
+    assert "the model written is the textbook" in doubts
+    (at,) = [at for at in commanded.judgement if at.horizon_s == 5.0]
+    assert at.model.position_m < 0.03
+    monkeypatch.setattr(generator, "identify", lambda *_, **__: commanded)
+    spec = without_wheels()
+    model, _ = generator.generate(
+        commanded.recording, spec, generator.mount_lidar(spec)
+    )
+    generator.save_model(model, tmp_path / "model")
+    kinematics = generator.load_model(tmp_path / "model").kinematics
+    assert kinematics.named.terms == commanded.model.named.terms
+    pose, _ = kinematics.step(np.zeros(3), np.zeros(0), np.array([1.0, 0.0]))
+    assert pose[0] == pytest.approx(kinematics.dt, rel=0.02)
+
+
+@pytest.mark.slow
+def test_the_textbook_is_fitted_no_further(commanded):
+    assert refit_model(commanded.drive, commanded.findings) is commanded.findings

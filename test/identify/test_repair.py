@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from identify import planted
-from identify.drives import drive, tricycle, with_values, without
+from identify.drives import (
+    NOISE,
+    drive,
+    fit_whole,
+    scale,
+    tricycle,
+    with_values,
+    without,
+)
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration, align
@@ -52,7 +60,7 @@ def with_jumps(recording: Recording, share: float = 0.05, seed: int = 0) -> Reco
         bad = rng.random(len(stream.t)) < share
         values = stream.values.copy()
         values[bad] += rng.normal(size=(bad.sum(), len(size))) * size
-        recording = replace(recording, **{name: replace(stream, values=values)})
+        recording = with_values(recording, **{name: values})
     return recording
 
 
@@ -68,7 +76,7 @@ def same_motion(a, b, share: float) -> None:
 
 @pytest.mark.parametrize(
     ("name", "noise"),
-    list(zip(ROBOTS, [(2e-3, 5e-3), (0.0, 0.0), (5e-4, 1e-3)], strict=True)),
+    list(zip(ROBOTS, [(2e-3, 5e-3), (0.0, 0.0), NOISE], strict=True)),
 )
 def test_a_recording_without_faults_is_not_touched(name, noise):
     spec = load_robot(name)
@@ -86,7 +94,7 @@ def test_a_recording_without_faults_is_not_touched(name, noise):
 )
 def test_a_drive_goes_on_after_a_jump_of_the_localiser_as_it_moved(name, jump):
     spec = load_robot(name)
-    plain = drive(spec, duration=20.0, noise=(5e-4, 1e-3))
+    plain = drive(spec, duration=20.0, noise=NOISE)
     late = plain.pose.t > 12.0
     values = plain.pose.values.copy()
     values[late] = geometry.compose(np.array(jump), values[late])
@@ -105,7 +113,7 @@ def test_a_drive_goes_on_after_a_jump_of_the_localiser_as_it_moved(name, jump):
 
 
 def test_a_gap_in_the_poses_is_no_jump(differential):
-    gappy = without(drive(differential, duration=20.0, noise=(5e-4, 1e-3)), 8.0, 11.0)
+    gappy = without(drive(differential, duration=20.0, noise=NOISE), 8.0, 11.0)
     assert repair_rows(Drive(gappy, differential))[1] == ()
 
 
@@ -119,7 +127,7 @@ def held(recording: Recording, begin: float, end: float) -> Recording:
 
 
 def test_a_pose_that_was_held_is_left_out_and_told(differential):
-    plain = drive(differential, duration=20.0, noise=(5e-4, 1e-3))
+    plain = drive(differential, duration=20.0, noise=NOISE)
     mended, notes = repair_rows(Drive(held(plain, 8.0, 11.0), differential))
     (told,) = notes
     assert "keeps one value from 8.0 s to 11.0 s and then leaps by" in told
@@ -128,7 +136,7 @@ def test_a_pose_that_was_held_is_left_out_and_told(differential):
 
 
 def test_a_drive_ends_where_its_pose_froze_though_commands_went_on(differential):
-    plain = drive(differential, duration=20.0, noise=(5e-4, 1e-3))
+    plain = drive(differential, duration=20.0, noise=NOISE)
     frozen = held(plain, 16.0, 99.0)
     mended, (told,) = repair_rows(Drive(frozen, differential))
     assert isinstance(told, Gap)
@@ -164,43 +172,35 @@ def test_steering_in_degrees_is_refused_though_the_limits_are_those_recorded():
         check_units(Drive(replace(plain, command=command), spec))
 
 
-@pytest.mark.parametrize("name", ["ackermann", "differential"])
-@pytest.mark.parametrize("ahead", [0.0, 0.4])
-def test_a_swapped_speed_and_turn_is_refused_by_what_they_move(name, ahead):
-    plain = drive(load_robot(name), pose_clock_ahead=ahead, rotation=0.4)
-    spec = load_robot(name)
-    assert check_commands(Drive(plain, spec)) == ()
-    command = replace(plain.command, values=plain.command.values[:, ::-1])
-    with pytest.raises(
-        RecordingError, match="_command are swapped: each moves the robot like"
-    ):
-        check_commands(Drive(replace(plain, command=command), spec))
-
-
 @pytest.mark.parametrize(
-    ("rotation", "pair"), [(0.4, (0, 1)), (0.0, (0, 2)), (0.4, (1, 2))]
+    ("name", "pair", "rotation", "ahead"),
+    [
+        ("ackermann", (0, 1), 0.4, 0.0),
+        ("differential", (0, 1), 0.4, 0.4),
+        ("mecanum", (0, 1), 0.4, 0.4),
+        ("mecanum", (0, 2), 0.0, 0.4),
+        ("mecanum", (1, 2), 0.4, 0.4),
+    ],
 )
-def test_swapped_commands_of_a_robot_that_moves_sideways_are_refused(pair, rotation):
-    spec = load_robot("mecanum")
-    plain = drive(spec, pose_clock_ahead=0.4, rotation=rotation)
+def test_swapped_commands_are_refused_by_what_they_move(name, pair, rotation, ahead):
+    spec = load_robot(name)
+    plain = drive(spec, pose_clock_ahead=ahead, rotation=rotation)
     assert check_commands(Drive(plain, spec)) == ()
-    order = np.arange(3)
-    order[list(pair)] = pair[::-1]
-    command = replace(plain.command, values=plain.command.values[:, order])
+    values = plain.command.values.copy()
+    values[:, pair] = values[:, pair[::-1]]
     one, other = (spec.command[k].name for k in pair)
     with pytest.raises(
         RecordingError, match=f"{one} and {other} are swapped: each moves"
     ):
-        check_commands(Drive(replace(plain, command=command), spec))
+        check_commands(Drive(with_values(plain, command=values), spec))
 
 
 @pytest.mark.parametrize(("rotation", "place"), [(0.8, 0), (0.0, 1), (np.pi, 0)])
 def test_a_reversed_command_of_a_robot_that_moves_sideways_is_told(place, rotation):
     spec = load_robot("mecanum")
     plain = drive(spec, pose_clock_ahead=0.4, rotation=rotation, noise=(2e-3, 3e-3))
-    values = plain.command.values * np.where(np.arange(3) == place, -1.0, 1.0)
-    turned = Drive(with_values(plain, command=values), spec)
-    (note,) = check_commands(turned)
+    turned = scale(plain, command=np.where(np.arange(3) == place, -1.0, 1.0))
+    (note,) = check_commands(Drive(turned, spec))
     assert isinstance(note, Mistake)
     assert note.startswith(
         "The robot moves right where left_command is positive, or back where"
@@ -225,11 +225,10 @@ def test_a_reversed_heading_is_refused_though_noise_hides_short_ways(differentia
     values = np.stack(pose) + rng.normal(size=(len(t), 3)) * [2e-3, 2e-3, 3e-3]
     made = Recording(Stream(t, np.stack([speed, turn], axis=1)), Stream(t, values))
     check_axes(Drive(made, differential))
-    other = replace(made, pose=Stream(t, values * [1.0, 1.0, -1.0]))
     with pytest.raises(
         RecordingError, match=r"write `heading: {from: ..., scale: -1}`"
     ):
-        check_axes(Drive(other, differential))
+        check_axes(Drive(scale(made, pose=[1.0, 1.0, -1.0]), differential))
 
 
 def test_two_commands_a_quarter_of_a_period_apart_are_not_swapped(differential):
@@ -253,9 +252,9 @@ def test_a_throttle_and_a_steering_that_are_swapped_are_refused_beyond_their_lim
     spec = build_robot(kind, limits)
     plain = drive(load_robot("ackermann"), measured_state=False)
     assert check_commands(Drive(plain, spec)) == ()
-    swapped = replace(plain.command, values=100.0 * plain.command.values[:, ::-1])
+    swapped = with_values(plain, command=100.0 * plain.command.values[:, ::-1])
     with pytest.raises(RecordingError, match="throttle and steering are swapped"):
-        identify(replace(plain, command=swapped), spec)
+        identify(swapped, spec)
 
 
 @pytest.mark.parametrize(
@@ -263,8 +262,7 @@ def test_a_throttle_and_a_steering_that_are_swapped_are_refused_beyond_their_lim
 )
 def test_a_speed_that_another_unit_explains_is_told(differential, column, unit, times):
     plain = drive(differential, latency=0.2)
-    values = plain.command.values * np.where(np.arange(2) == column, times, 1.0)
-    other = with_values(plain, command=values)
+    other = scale(plain, command=np.where(np.arange(2) == column, times, 1.0))
     (note,) = check_commands(Drive(other, differential))
     assert f"if they are in {unit}, write `unit: {unit}`" in note
     assert isinstance(note, Mistake)
@@ -288,12 +286,12 @@ def test_wheels_in_rpm_are_told_if_their_radius_is_known():
     unknown = build_robot(wheels)
     plain = drive(known, measured_state=False)
     assert check_commands(Drive(plain, known)) == ()
-    other = with_values(plain, command=plain.command.values * 9.55)
+    other = scale(plain, command=9.55)
     assert "write `unit: rpm` beside `from:`" in check_commands(Drive(other, known))[0]
     assert check_commands(Drive(other, unknown)) == ()
 
 
-def by_wheels(ahead_m: float = 0.0) -> tuple[Recording, RobotSpec]:
+def by_wheels() -> tuple[Recording, RobotSpec]:
     """A drive whose commands are the measured wheels, tracked at a point ahead of the axle."""
     given = {
         "kind": "differential_wheels",
@@ -304,21 +302,17 @@ def by_wheels(ahead_m: float = 0.0) -> tuple[Recording, RobotSpec]:
         },
     }
     whole = planted.wheeled_drive()
-    ahead = geometry.compose(whole.pose.values, np.array([ahead_m, 0.0, 0.0]))
-    pose = replace(whole.pose, values=ahead)
+    ahead = geometry.compose(whole.pose.values, np.array([0.2, 0.0, 0.0]))
+    recording = with_values(whole, pose=ahead)
     spec = build_robot(given, {})
-    return replace(whole, command=whole.state, pose=pose, state=None), spec
+    return replace(recording, command=whole.state, state=None), spec
 
 
-@pytest.mark.parametrize("ahead_m", [0.2])
-def test_an_encoder_that_counts_backwards_is_named_though_it_is_the_command(ahead_m):
-    recording, spec = by_wheels(ahead_m)
+def test_an_encoder_that_counts_backwards_is_named_though_it_is_the_command():
+    recording, spec = by_wheels()
     assert check_encoders(Drive(recording, spec)) == ()
     for signs, names in (((-1.0, 1.0), ["left_wheel"]), ((1.0, -1.0), ["right_wheel"])):
-        values = recording.command.values * signs
-        command = replace(recording.command, values=values)
-        reversed_ = replace(recording, command=command)
-        told = check_encoders(Drive(reversed_, spec))
+        told = check_encoders(Drive(scale(recording, command=signs), spec))
         assert [note.split()[0] for note in told] == names
         assert all("its encoder counts backwards; write `scale: -1`" in n for n in told)
         assert all(isinstance(note, Mistake) for note in told)
@@ -326,7 +320,7 @@ def test_an_encoder_that_counts_backwards_is_named_though_it_is_the_command(ahea
 
 @pytest.mark.parametrize("inputs", ["wheels", "measured wheels", "twists"])
 def test_inputs_tell_a_clockwise_heading_of_a_point_ahead_of_the_axle(inputs):
-    recording, spec = by_wheels(ahead_m=0.2)
+    recording, spec = by_wheels()
     if inputs != "wheels":
         spec = planted.wheeled()
         recording = replace(planted.wheeled_drive(), pose=recording.pose)
@@ -334,22 +328,20 @@ def test_inputs_tell_a_clockwise_heading_of_a_point_ahead_of_the_axle(inputs):
         spec = spec.model_copy(update={"state": ()})
         recording = replace(recording, state=None)
     check_axes(Drive(recording, spec))
-    values = recording.pose.values * [1.0, 1.0, -1.0]
-    mirrored = with_values(recording, pose=values)
     with pytest.raises(
         RecordingError, match=r"heading counted clockwise write .*scale: -1\}"
     ):
-        check_axes(Drive(mirrored, spec))
+        check_axes(Drive(scale(recording, pose=[1.0, 1.0, -1.0]), spec))
 
 
 @pytest.mark.slow
 def test_a_noisy_fit_survives_both(differential):
     rng = np.random.default_rng(2)
-    plain = drive(differential, noise=(5e-4, 1e-3), latency=0.05)
+    plain = drive(differential, duration=30.0, noise=NOISE, latency=0.05)
     keep = {n: rng.random(len(s.t)) > 0.1 for n, s in plain.streams.items()}
     keep["command"][:] = True
-    clean = identify(plain, differential)
-    faulty = identify(some(with_jumps(plain), keep), differential)
+    clean = fit_whole(plain, differential, order=1)
+    faulty = fit_whole(some(with_jumps(plain), keep), differential, order=1)
     same_motion(faulty, clean, 0.03)
     assert faulty.calibration.command_latency_s == pytest.approx(0.05, abs=3e-3)
 
@@ -402,10 +394,10 @@ def test_a_stream_that_is_mixed_of_two_is_refused(car):
 
 @pytest.mark.slow
 def test_noise_of_the_measured_state_does_not_bend_its_lag(differential):
-    plain = drive(differential, noise=(5e-4, 1e-3))
+    plain = drive(differential, noise=NOISE)
     noise = np.random.default_rng(0).normal(size=plain.state.values.shape) * 0.2
-    state = replace(plain.state, values=plain.state.values + noise)
-    model = identify(replace(plain, state=state), differential).model
+    recording = with_values(plain, state=plain.state.values + noise)
+    model = fit_whole(recording, differential, order=1).model
     value = model.named.terms["d_left_wheel"]["left_wheel"]
     error = model.named_errors["d_left_wheel"]["left_wheel"]
     assert error < 0.2

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from identify.drives import make_model, slipping_car
+from identify.drives import make_model, throttle_car
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.shooting import (
     Parameters,
@@ -26,7 +26,7 @@ DELAY = 0.1
 @pytest.fixture(scope="module")
 def car() -> TaylorModel:
     """vx' = 4 throttle - 2 vx, wz' = 8 steering - 5 wz."""
-    spec, _ = slipping_car(duration=1.0)
+    spec = throttle_car()
     terms = {
         "vx": {"vx": 1.0},
         "wz": {"wz": 1.0},

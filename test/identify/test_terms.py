@@ -5,23 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from identify.drives import (
-    identify_servoed,
-    make_model,
-    servoed,
-    slipping_car,
-    tricycle,
-)
-from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.drive import Drive, Settings
+from identify.drives import make_model, slipping_car, throttle_car, tricycle
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.findings import resample_drive
-from nics_drl_bridge.identify.identify import (
-    STAGES,
-    Identified,
-    complete_model,
-    fit_terms,
-    run,
-)
+from nics_drl_bridge.identify.identify import STAGES, fit_terms, run
 from nics_drl_bridge.identify.terms import (
     Kind,
     Library,
@@ -35,56 +22,7 @@ from nics_drl_bridge.identify.terms import (
 )
 from nics_drl_bridge.recording.recording import Samples, samples_on_one_clock
 from nics_drl_bridge.robot import taylor
-from nics_drl_bridge.robot.spec import build_robot
-
-BASE = 0.9
-
-
-def car_like(state):
-    speed, angle = state.T
-    return np.stack([speed, 0.0 * speed, speed * np.tan(angle) / BASE], axis=1)
-
-
-def share(found: Identified) -> float:
-    assert found.held_out is not None
-    return found.held_out.mean_position_error_m / found.held_out.mean_path_m
-
-
-def off(calibration: Calibration, mounting: tuple[float, float, float]) -> np.ndarray:
-    """Errors of the mounting in its own standard errors."""
-    x, y, heading = mounting
-    names = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad")
-    sigma = [max(calibration.uncertainty[name], 1e-4) for name in names]
-    return (
-        np.array([*calibration.lever_arm_m, calibration.rotation_rad])
-        - [x, y, -heading]
-    ) / sigma
-
-
-@pytest.mark.slow
-def test_a_tricycle_that_steers_far_gets_its_order_and_mounting_by_itself():
-    found = identify_servoed()
-    trials = found.findings.trials
-    assert [trial.order for trial in trials] == [0, 2, 3, 4]
-    assert found.model.powers.sum(axis=1).max() >= 3
-    assert share(found) < 0.02
-    assert np.abs(off(found.calibration, (0.25, 0.12, 0.5))).max() < 3.0
-    assert found.calibration.command_latency_s == pytest.approx(0.1, abs=0.005)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.campaign)])
-def test_a_dead_zone_is_not_taken_for_a_mounting(seed):
-    mounting = (0.0, 0.0, 0.0)
-    recording = servoed(
-        seed=seed, dead=0.15, steering=0.5, mounting=mounting, duration=40.0
-    )
-    settings = Settings(order=2, alpha="auto", train_until_s=40.0)
-    found = run(
-        STAGES[: STAGES.index(complete_model)], Drive(recording, tricycle(), settings)
-    )
-    assert np.abs(off(found.calibration, mounting)).max() < 3.0
-    assert found.calibration.rotation_rad == pytest.approx(0.0, abs=0.003)
+from nics_drl_bridge.robot.spec import RobotSpec, build_robot
 
 
 def test_a_textbook_of_a_front_driven_tricycle_is_expanded_with_its_trim():
@@ -143,12 +81,12 @@ def test_a_mirror_leaves_even_terms_along_x_and_odd_ones_across():
 
 
 def test_a_mirror_turns_the_steering_and_what_it_moves_aside():
-    spec, _ = slipping_car(duration=1.0)
+    spec = throttle_car()
     assert list_reversed_variables(spec) == ("vy", "wz", "steering")
 
 
 def test_the_twist_of_a_car_follows_its_commands_and_with_tyres_its_lateral_acceleration():
-    spec, _ = slipping_car(duration=1.0)
+    spec = throttle_car()
     powers = taylor.list_exponents(len(spec.variable_names), 3)
 
     def terms(dof: str, **given: object) -> set[str]:
@@ -165,32 +103,32 @@ def test_the_twist_of_a_car_follows_its_commands_and_with_tyres_its_lateral_acce
 
 
 def test_only_cars_that_steer_in_front_slip_by_their_tyres(differential):
-    spec, _ = slipping_car(duration=1.0)
+    spec = throttle_car()
     assert has_slipping_tyres(spec)
     assert not has_slipping_tyres(differential)
     assert not has_slipping_tyres(tricycle())
 
 
-def held_throttle(**given):
-    spec, recording = slipping_car(throttle=0.25, friction=0.0, duration=20.0, **given)
-    drive = Drive(recording, spec, Settings(train_until_s=20.0))
-    found = run(STAGES[: STAGES.index(fit_terms)], drive)
+@pytest.fixture(scope="module")
+def held_throttle() -> tuple[RobotSpec, Samples]:
+    """A robot, and samples of its motion under one throttle."""
+    spec, recording = slipping_car(throttle=0.25, friction=0.0, duration=20.0)
+    found = run(STAGES[: STAGES.index(fit_terms)], Drive(recording, spec))
     return spec, resample_drive(found.training, found)
 
 
 @pytest.mark.slow
-def test_a_command_held_at_one_value_pushes_as_a_constant():
-    spec, samples = held_throttle()
+def test_a_command_held_at_one_value_pushes_as_a_constant(held_throttle):
+    spec, samples = held_throttle
     model = fit_motion_terms(samples, spec, 3, select_textbook_terms).model
     assert model.rates(np.zeros(5))[3] == pytest.approx(9.0 * 0.15, rel=0.2)
-    assert model.rates([0.0, 0, 0, 0, 0.5])[5] == pytest.approx(
-        0.0, abs=0.1
-    )  # it steers only
+    steered = model.rates([0.0, 0, 0, 0, 0.5])[5]
+    assert steered == pytest.approx(0.0, abs=0.1)  # it steers only
 
 
 @pytest.mark.slow
-def test_a_speed_that_never_changed_is_a_constant_of_the_twist():
-    spec, samples = held_throttle()
+def test_a_speed_that_never_changed_is_a_constant_of_the_twist(held_throttle):
+    spec, samples = held_throttle
     steady = samples.rows(samples.t > samples.t[0] + 10.0)
     steady.x[:, :2] = 2.0, 0.0
     model = fit_motion_terms(steady, spec, 3, select_textbook_terms).model

@@ -8,7 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from identify.drives import draw_commands, follow_commands, with_values
+from identify.drives import (
+    NOISE,
+    draw_commands,
+    fit_trial,
+    fit_whole,
+    follow_commands,
+    with_values,
+)
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
@@ -25,9 +32,9 @@ def robot(name: str) -> RobotSpec:
     return load_robot(str(ROBOTS / f"{name}.yaml"))
 
 
-def recorded(spec, target, twist, noise=(0.0, 0.0), latency=0.0):
-    """A minute of a robot whose state follows `target(command)` and that moves by a twist."""
-    commands = draw_commands(spec, 3000)
+def recorded(spec, target, twist, noise=(0.0, 0.0), latency=0.0, count=2000):
+    """A robot whose state follows `target(command)` and that moves by a twist."""
+    commands = draw_commands(spec, count)
     made = follow_commands(commands, target, twist, LAG, DT, noise)
     return replace(made, command=replace(made.command, t=made.command.t - latency))
 
@@ -61,38 +68,44 @@ def terms(found):
     return found.model.named.terms
 
 
-@pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-4, 1e-3)])
-def test_a_car_of_another_wheelbase_with_its_steering_first(noise):
+@pytest.mark.slow
+def test_a_car_of_another_wheelbase_with_its_steering_first():
     spec = robot("long_car")
-    found = identify(recorded(spec, lambda c: c, car_twist, noise), spec)
-    assert (
-        sum(v for k, v in terms(found)["wz"].items() if k.startswith("wheel_angle*pa"))
-        > 1.5
-    )
-    x = np.array([0.3, 1.0, 0.3, 1.0])
-    assert found.model.rates(x)[:3] == pytest.approx(
-        [1.0, 0.0, np.tan(0.3) / WHEELBASE], abs=0.05
-    )
+    found = fit_trial(recorded(spec, lambda c: c, car_twist, NOISE), spec)
+    turned = [
+        v for k, v in terms(found)["wz"].items() if k.startswith("wheel_angle*pa")
+    ]
+    assert sum(turned) > 1.5
+    rates = found.model.rates(np.array([0.3, 1.0, 0.3, 1.0]))
+    ahead = [1.0, 0.0, np.tan(0.3) / WHEELBASE]
+    assert rates[:3] == pytest.approx(ahead, abs=0.05)
     assert found.held_out.mean_position_error_m < 0.06
     assert found.model.quality.held_out_r2["wz"] > 0.99
 
 
-@pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-4, 1e-3)])
-def test_a_skid_steer_shows_its_slip(noise):
+def test_a_skid_steer_shows_its_slip_and_may_list_state_and_command_in_any_order():
     spec = robot("skid_steer")
-    found = identify(recorded(spec, skid_target, skid_twist, noise), spec)
-    x = np.array([8.0, 4.0, *np.array([[0.6, 1.0]])[0]])
-    assert found.model.rates(x)[:3] == pytest.approx(
-        skid_twist(x[None, :2])[0], abs=0.02
-    )
+    recording = recorded(spec, skid_target, skid_twist)
+    found = identify(recording, spec)
+    rates = found.model.rates(np.array([8.0, 4.0, 0.6, 1.0]))
+    assert rates[:3] == pytest.approx(skid_twist(np.array([[8.0, 4.0]]))[0], abs=0.02)
     assert found.held_out.mean_position_error_m < 0.03
+    data = spec.model_dump()
+    data["state"], data["command"] = data["state"][::-1], data["command"][::-1]
+    values = {
+        name: recording.streams[name].values[:, ::-1] for name in ("state", "command")
+    }
+    turned = RobotSpec.model_validate(data)
+    other = terms(identify(with_values(recording, **values), turned))
+    for dof, row in terms(found).items():
+        assert other[dof] == pytest.approx(row, rel=1e-6)
 
 
 @pytest.mark.slow
 def test_a_robot_without_any_state_but_three_commands():
     spec = robot("stateless")
-    recording = recorded(spec, lambda c: c, omni_twist, (5e-4, 1e-3), latency=0.1)
-    found = identify(replace(recording, state=None), spec)
+    recording = recorded(spec, lambda c: c, omni_twist, NOISE, latency=0.1)
+    found = fit_trial(replace(recording, state=None), spec)
     assert found.model.state_size == 0
     # a lag without a state acts as a delay
     assert found.calibration.command_latency_s == pytest.approx(0.1 + LAG, abs=0.05)
@@ -103,25 +116,8 @@ def test_a_robot_without_any_state_but_three_commands():
 @pytest.mark.slow
 def test_the_uncertainty_of_the_latency_covers_the_step_of_the_model():
     spec = robot("long_car")
-    recording = recorded(spec, lambda c: c, car_twist, (5e-4, 1e-3), latency=0.15)
-    found = identify(replace(recording, state=None), spec).calibration
+    recording = recorded(spec, lambda c: c, car_twist, NOISE, latency=0.15, count=1500)
+    found = fit_whole(replace(recording, state=None), spec).calibration
     sigma = found.uncertainty["command_latency_s"]
     assert abs(found.command_latency_s - 0.15) < 3.0 * sigma
     assert sigma < DT
-
-
-def test_the_order_of_state_and_command_is_that_of_the_file():
-    spec = robot("skid_steer")
-    data = spec.model_dump()
-    data["state"], data["command"] = data["state"][::-1], data["command"][::-1]
-    turned = RobotSpec.model_validate(data)
-    recording = recorded(spec, skid_target, skid_twist)
-    other = with_values(
-        recording,
-        state=recording.state.values[:, ::-1],
-        command=recording.command.values[:, ::-1],
-    )
-    a = terms(identify(recording, spec))
-    b = terms(identify(other, turned))
-    for dof in a:
-        assert b[dof] == pytest.approx(a[dof], rel=1e-6)

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from identify.drives import drive, with_values
+from identify.drives import drive, fit_trial, with_values
 from nics_drl_bridge.identify import judgement
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.identify import identify, prefer_textbook
 from nics_drl_bridge.identify.open_loop import measure_open_loop_error
 from nics_drl_bridge.identify.report import explain_uselessness, is_useless
 from nics_drl_bridge.identify.verdict import describe_coarsest_state
@@ -18,12 +18,6 @@ from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import RobotSpec
 
 TOO_COARSE = "between rows that are 0.3 s apart, so record at a higher rate."
-
-
-THREE_ROBOTS = [
-    "car",
-    *(pytest.param(n, marks=pytest.mark.campaign) for n in ("mecanum", "differential")),
-]
 
 
 def coarse(spec: RobotSpec, every: int, duration: float = 60.0) -> Recording:
@@ -74,18 +68,32 @@ def test_standing_still_is_off_by_the_way_from_start_to_end(car):
     assert result.mean_path_m == pytest.approx(1.0)
 
 
-@pytest.fixture
-def no_textbook(monkeypatch):
-    """Leaves a model as it is, however much better its textbook is."""
-    monkeypatch.setattr(judgement, "is_beaten_by_textbook", lambda judgement: False)
+@pytest.fixture(scope="module")
+def useless(car):
+    """A fit to a coarse drive, whose textbook, which is much better, did not take its place."""
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        patch.setattr(judgement, "is_beaten_by_textbook", lambda judgement: False)
+        warnings.simplefilter("error")
+        return fit_trial(coarse(car, every=30), car, alpha="auto")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", THREE_ROBOTS)
-def test_the_textbook_takes_the_place_of_a_useless_model(name, request):
-    spec = request.getfixturevalue(name)
-    found = identify(coarse(spec, every=30), spec, alpha="auto")
-    assert found.findings.replacement in found.notes
+def test_a_model_that_predicts_nothing_is_told_of_in_one_sentence(useless):
+    sentence = explain_uselessness(useless)
+    assert "is useless: on unseen data its predictions end" in sentence
+    assert useless.verdict is judgement.Verdict.DO_NOT_TRAIN
+    ran_away = replace(useless.held_out, mean_position_error_m=np.inf)
+    sentence = explain_uselessness(replace(useless, held_out=ran_away))
+    assert "its predictions have diverged after 5 s" in sentence
+
+
+@pytest.mark.slow
+def test_the_textbook_takes_the_place_of_a_useless_model(useless):
+    assert not useless.findings.replacement
+    findings = prefer_textbook(useless.findings.whole, useless.findings)
+    found = replace(useless, findings=findings, notes=findings.notes)
+    found = replace(found, model=findings.model, held_out=findings.held_out)
+    assert findings.replacement in found.notes
     assert explain_uselessness(found) == ""
     assert any(gap.endswith(TOO_COARSE) for gap in found.gaps)
 
@@ -133,22 +141,3 @@ def test_a_model_of_too_few_terms_is_not_put_down_to_the_recording(car):
     found = identify(record(car, np.random.default_rng(0), 60.0), car, alpha=0.5)
     sentence = explain_uselessness(found)
     assert sentence.endswith("it may lack terms, so leave order and alpha at `auto`.")
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("no_textbook")
-@pytest.mark.parametrize(
-    "name", [pytest.param("car", marks=pytest.mark.campaign), "mecanum"]
-)
-def test_a_model_that_predicts_nothing_is_told_of_in_one_sentence(name, request):
-    spec = request.getfixturevalue(name)
-    recording = coarse(spec, every=30)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        found = identify(recording, spec)
-        sentence = explain_uselessness(found)
-    assert "is useless: on unseen data its predictions end" in sentence
-    assert found.verdict is judgement.Verdict.DO_NOT_TRAIN
-    ran_away = replace(found.held_out, mean_position_error_m=np.inf)
-    sentence = explain_uselessness(replace(found, held_out=ran_away))
-    assert "its predictions have diverged after 5 s" in sentence

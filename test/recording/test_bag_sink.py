@@ -19,11 +19,6 @@ from nics_drl_bridge.recording.write import open_bag_sink
 STORAGES = ("mcap", "sqlite3")
 
 
-def storage_file(bag):
-    (file,) = (p for p in bag.iterdir() if p.name != "metadata.yaml")
-    return file
-
-
 def held(bag):
     """All messages of a bag."""
     with open_bag(bag) as whole:
@@ -159,7 +154,7 @@ def test_a_type_that_nobody_knows_is_written_with_its_text(tmp_path):
     with open_bag_sink(tmp_path / "bag") as sink:
         sink.add_topic("/own", "my_msgs/msg/Own", texts=texts)
         sink.write("/own", bags.ns(0.0), data)
-    assert b"float64 y" in storage_file(tmp_path / "bag").read_bytes()
+    assert b"float64 y" in bags.storage_file(tmp_path / "bag").read_bytes()
     assert held(tmp_path / "bag") == {"/own": [(bags.ns(0.0), data)]}
 
 

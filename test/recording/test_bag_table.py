@@ -131,7 +131,7 @@ def test_transforms_are_poses_between_two_frames(tmp_path):
         car = bags.transform(t, bags.place_at(t))
         return bags.transforms(bags.transform(t, (9.0, 9.0, 0.0), child="box"), car)
 
-    rows = [(t, both(t)) for t in bags.times()]
+    rows = bags.every(bags.STEP_S, both)
     bag = bags.write(tmp_path / "bag", {"/tf": rows, "/cmd_vel": bags.commands()})
     pose = "pose: {in: /tf, child_frame: car}"
     found = read(bag, f"command: {{v: '/cmd_vel:linear.x'}}\n{pose}")
@@ -171,7 +171,7 @@ def test_pose_and_commands_are_on_the_clock_that_mapping_or_headers_say(
 
 
 def test_the_covariance_of_a_message_gives_deviations(tmp_path):
-    rows = [(t, bags.pose_with_covariance(t, *bags.place_at(t))) for t in bags.times()]
+    rows = bags.along(bags.pose_with_covariance)
     topics = {"/pose": rows, "/v": bags.commands()}
     assert read(bags.write(tmp_path / "none", topics), COMMAND).pose.sigma is None
     for _, message in rows:
@@ -193,10 +193,7 @@ def test_a_bag_is_surveyed_to_a_first_mapping(tmp_path):
 
 
 def test_a_bag_whose_headers_were_set_back_is_stamped_by_arrival_and_says_so(tmp_path):
-    poses = [
-        (t, bags.pose_stamped(t - 30.0 * (t > 1.0), *bags.place_at(t)))
-        for t in bags.times()
-    ]
+    poses = bags.along(lambda t, *at: bags.pose_stamped(t - 30.0 * (t > 1.0), *at))
     bag = bags.write(tmp_path / "set", {"/pose": poses, "/v": bags.commands()})
     found = read(bag, COMMAND)
     assert np.allclose(np.diff(found.pose.t), np.diff(bags.times()))

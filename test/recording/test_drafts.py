@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.recording.survey import split_unit
@@ -23,11 +24,7 @@ def motion() -> dict[str, np.ndarray]:
     t = np.arange(COUNT) * STEP
     v = np.repeat(rng.uniform(0.2, 1.0, COUNT // 20), 20)
     w = np.repeat(rng.uniform(-0.8, 0.8, COUNT // 20), 20)
-    speed = np.zeros(COUNT)
-    rate = np.zeros(COUNT)
-    for k in range(1, COUNT):
-        speed[k] = speed[k - 1] + 0.25 * (v[k - 1] - speed[k - 1])
-        rate[k] = rate[k - 1] + 0.25 * (w[k - 1] - rate[k - 1])
+    speed, rate = lfilter([0.0, 0.25], [1.0, -0.75], [v, w])
     yaw = np.cumsum(rate) * STEP
     x = np.cumsum(speed * np.cos(yaw)) * STEP
     y = np.cumsum(speed * np.sin(yaw)) * STEP

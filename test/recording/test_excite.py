@@ -27,26 +27,23 @@ ROBOTS = [load_robot(name) for name in ("ackermann", "differential", "mecanum")]
 ]
 STILL = round(STILL_S / PERIOD_S)
 
-CAMPAIGN = pytest.mark.campaign
-SEEDS = [0, *(pytest.param(seed, marks=CAMPAIGN) for seed in (1, 2))]
 PREVIEWS: dict = {}
 
 robots = pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
 
 
-def preview(robot, duration=30.0, speed=1.0, seed=0) -> Pattern:
+def preview(robot, speed=1.0) -> Pattern:
     """The pattern of a drive, made once."""
-    key = (robot.name, duration, speed, seed)
+    key = (robot.name, speed)
     if key not in PREVIEWS:
-        PREVIEWS[key] = DrivePlan(robot, 2.0, duration, speed, seed).preview()
+        PREVIEWS[key] = DrivePlan(robot, 2.0, 30.0, speed, seed=0).preview()
     return PREVIEWS[key]
 
 
 @pytest.mark.slow
 @robots
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_whole_robot_keeps_within_its_circle(robot, seed):
-    pattern = preview(robot, seed=seed)
+def test_the_whole_robot_keeps_within_its_circle(robot):
+    pattern = preview(robot)
     away = np.hypot(*pattern.pose[:, :2].T) + robot.footprint_radius
     assert 0.8 < away.max() <= 2.0
 
@@ -61,12 +58,12 @@ def test_it_begins_and_ends_at_rest(robot):
     assert np.abs(pattern.twist[-1]).max() < 1e-3
 
 
-@robots
-@pytest.mark.parametrize("speed", [1.0, pytest.param(0.5, marks=CAMPAIGN)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("robot", "speed"), [(ROBOTS[0], 0.5), (ROBOTS[2], 1.0)])
 def test_commands_stay_within_a_share_of_the_limits_that_leaves_angles_alone(
     robot, speed
 ):
-    command = preview(robot, 60.0, speed).command
+    command = preview(robot, speed).command
     share = np.array([1.0 if c.unit == "rad" else speed for c in robot.command])
     assert (command >= share * robot.command_low - 1e-12).all()
     assert (command <= share * robot.command_high + 1e-12).all()
@@ -94,7 +91,7 @@ def test_every_command_is_moved_by_the_rules_that_a_fit_judges_a_drive_by(robot)
 
 def drive_another(robot, really, gain, seed):
     """Greatest distance of a robot that moves otherwise than expected, and is watched."""
-    drive = DrivePlan(robot, bound=2.0, duration=30.0, seed=seed).begin()
+    drive = DrivePlan(robot, bound=2.0, duration=20.0, seed=seed).begin()
     motion = predict_motion(really)
     pose = np.zeros((1, 3))
     state = np.zeros((1, motion.size))
@@ -109,33 +106,20 @@ def drive_another(robot, really, gain, seed):
     return away + robot.footprint_radius
 
 
-@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "changes", "gain"),
     [
         ("ackermann", {"wheelbase": 0.24, "speed_lag": 0.2}, (1.1, 1.0)),
         ("mecanum", {"wheel_lag": 0.2}, (1.2, 0.8, 1.2)),
-        pytest.param(
-            "ackermann",
-            {"wheelbase": 0.17, "steering_lag": 0.2},
-            (0.8, 1.0),
-            marks=pytest.mark.campaign,
-        ),
-        pytest.param(
-            "differential",
-            {"track": 0.25, "wheel_lag": 0.2},
-            (1.1, 0.9),
-            marks=pytest.mark.campaign,
-        ),
     ],
 )
 def test_a_robot_that_moves_otherwise_than_expected_is_kept_within_too(
-    name, changes, gain, seed
+    name, changes, gain
 ):
     robot = load_robot(name)
     really = robot.model_copy(update={"parameters": {**robot.parameters, **changes}})
-    assert drive_another(robot, really, np.array(gain), seed) <= 2.0
+    assert drive_another(robot, really, np.array(gain), seed=0) <= 2.0
 
 
 @pytest.mark.slow

@@ -59,9 +59,9 @@ def test_the_imu_of_a_bag_and_of_its_draft_is_read_as_it_is_mounted(
     tmp_path, axis, sign
 ):
     topics = bags.drive()
-    topics["/imu/data"] = [
-        (t, mounted(t, 0.25 + 0.1 * np.sin(t), axis, sign)) for t in bags.times(0.02)
-    ]
+    topics["/imu/data"] = bags.every(
+        0.02, lambda t: mounted(t, 0.25 + 0.1 * np.sin(t), axis, sign)
+    )
     bag = bags.write(tmp_path / "bag", topics)
     read = read_recording(bag, load_robot("differential"), TopicRoles())
     assert read.imu.values[:, 2].mean() == pytest.approx(0.25, abs=0.08)

@@ -21,6 +21,12 @@ def columns():
     return drive()
 
 
+@pytest.fixture
+def log(tmp_path, columns):
+    """Writes the drive, with other columns beside or instead of its own."""
+    return lambda more=None: write(tmp_path / "log.csv", columns | (more or {}))
+
+
 def same(one, other):
     return all(
         np.allclose(one.streams[name].t, other.streams[name].t, atol=1e-6)
@@ -29,8 +35,8 @@ def same(one, other):
     )
 
 
-def test_columns_are_streams_by_name_or_by_number(tmp_path, columns):
-    named = read(write(tmp_path / "log.csv", columns))
+def test_columns_are_streams_by_name_or_by_number(log, tmp_path, columns):
+    named = read(log())
     assert np.allclose(named.pose.values[:, 2], columns["yaw"])
     assert named.variables == ("v", "w")
     assert named.repairs == ()
@@ -88,10 +94,10 @@ def test_a_command_counts_only_while_its_flags_are_set(tmp_path, columns):
     assert np.array_equal(found.command.values[:, 0], np.where(on, 0.5, -1.0))
 
 
-def test_quaternions_are_headings_and_variances_deviations(tmp_path, columns):
+def test_quaternions_are_headings_and_variances_deviations(log, columns):
     half = columns["yaw"] / 2.0
     turned = {"qz": np.sin(half), "qw": np.cos(half), "q": 0.0 * half}
-    path = write(tmp_path / "log.csv", columns | turned | {"c": np.full(200, 4.0)})
+    path = log(turned | {"c": np.full(200, 4.0)})
     place = "x: {from: x, scale: 100.0}, y: {from: y, scale: 100.0}, unit: cm"
     pose = f"pose: {{{place}, quaternion: [q, q, qz, qw], covariance: [%s]}}"
     found = read(path, pose % "c, c, c")
@@ -103,10 +109,10 @@ def test_quaternions_are_headings_and_variances_deviations(tmp_path, columns):
     assert read(path, pose % "q, q, q").pose.sigma is None
 
 
-def test_a_variance_that_is_no_positive_number_is_unknown(tmp_path, columns):
+def test_a_variance_that_is_no_positive_number_is_unknown(log, columns):
     variance = np.full_like(columns["x"], 4.0)
     variance[3:6] = 0.0, -1.0, np.inf
-    path = write(tmp_path / "log.csv", columns | {"c": variance})
+    path = log({"c": variance})
     found = read(path, "pose: {x: x, y: y, heading: yaw, covariance: [c, c, c]}")
     known = np.isfinite(found.pose.sigma).all(axis=1)
     assert np.flatnonzero(~known).tolist() == [3, 4, 5]
@@ -126,10 +132,10 @@ def test_counts_that_come_at_once_are_of_the_time_since_the_burst_before(
     assert found.command.values == pytest.approx(speed, rel=0.05)
 
 
-def test_the_rate_of_a_counter_holds_until_the_stamp_that_shows_it(tmp_path, columns):
+def test_the_rate_of_a_counter_holds_until_the_stamp_that_shows_it(log, columns):
     speed = np.where(columns["t"] < 2.0, 400.0, 900.0)
     ticks = 65_000.0 + np.append(0.0, np.cumsum(speed[:-1] * 0.02))
-    path = write(tmp_path / "log.csv", columns | {"n": ticks % 65_536, "m": -ticks})
+    path = log({"n": ticks % 65_536, "m": -ticks})
     sides = "{left: {from: n, ticks_per_turn: 100}, right: {from: m, unit: ticks, scale: -1}}"
     found = read(path, f"command: {sides}")
     assert np.allclose(
@@ -142,12 +148,12 @@ def test_the_rate_of_a_counter_holds_until_the_stamp_that_shows_it(tmp_path, col
     assert np.allclose(wheels.t, columns["t"][:-1] + 0.01)  # between two stamps
 
 
-def test_an_absolute_encoder_is_an_angle_about_zero(tmp_path, columns):
+def test_an_absolute_encoder_is_an_angle_about_zero(log, columns):
     # It begins below zero, near the end of its range.
     angle = 0.3 * np.sin(columns["t"] - 0.5)
     counts = np.round(angle / (2.0 * np.pi) * 8192) % 8192
     value = "{from: n, ticks_per_turn: 8192, wrap: 8192, differentiate: false}"
-    path = write(tmp_path / "log.csv", columns | {"n": counts})
+    path = log({"n": counts})
     found = read(path, f"command: {{steering: {value}}}")
     assert np.allclose(found.command.values[:, 0], angle, atol=1e-3)
 
@@ -168,9 +174,9 @@ def test_a_folder_has_its_values_in_several_files(tmp_path, columns):
     assert changed == pytest.approx(turn["t"][np.argmax(turn["w"] > 0.27)])
 
 
-def test_streams_of_other_clocks_keep_their_offset_or_begin_at_zero(tmp_path, columns):
+def test_streams_of_other_clocks_keep_their_offset_or_begin_at_zero(log, columns):
     stamps = {"near": columns["t"] + 1.0, "far": columns["t"] + 1e9}
-    path = write(tmp_path / "log.csv", columns | stamps)
+    path = log(stamps)
     pose = "pose: {x: x, y: y, heading: yaw, clock: mocap, time: %s}"
     near = read(path, pose % "near")
     assert (near.pose.t[0], near.command.t[0]) == pytest.approx((1.0, 0.0))
@@ -243,9 +249,9 @@ def spoil(columns):
     ],
 )
 def test_what_only_a_wrong_mapping_explains_is_refused_with_the_line_to_write(
-    tmp_path, columns, changes, fix
+    log, columns, changes, fix
 ):
-    path = write(tmp_path / "log.csv", spoil(columns))
+    path = log(spoil(columns))
     with pytest.raises((ConfigError, RecordingError)) as refused:
         read(path, changes)
     assert fix in str(refused.value)
@@ -279,8 +285,8 @@ command: {steering_command: {from: w}, speed_command: {from: v, scale: 3.0}}
 LORRY = "kind: tricycle\nfootprint_radius: 0.9\nparameters: {wheelbase: 1.2}\n"
 
 
-def test_commands_come_in_the_order_of_the_robot(tmp_path, columns):
-    path = write(tmp_path / "log.csv", columns)
+def test_commands_come_in_the_order_of_the_robot(log):
+    path = log()
     spec, found = open_drive(path, None, change_map(STEERED % "ackermann"))
     assert spec.name == "ackermann"
     assert found.variables == spec.variable_names
@@ -291,10 +297,10 @@ def test_commands_come_in_the_order_of_the_robot(tmp_path, columns):
         open_drive(path, None, change_map(STEERED % "null"))
 
 
-def test_a_robots_file_is_one_robot_however_it_is_named_and_is_kept(tmp_path, columns):
+def test_a_robots_file_is_one_robot_however_it_is_named_and_is_kept(log, tmp_path):
     file = tmp_path / "lorry.yaml"
     file.write_text(LORRY)
-    path = write(tmp_path / "log.csv", columns)
+    path = log()
     spec, drive = open_drive(path, None, change_map(STEERED % file))
     assert spec == open_drive(path, str(file), change_map(STEERED % "car"))[0]
     assert sorted(spec.command_high) == [0.3, 1.5]  # as recorded
@@ -308,20 +314,20 @@ def test_a_robots_file_is_one_robot_however_it_is_named_and_is_kept(tmp_path, co
         assert open_drive(tmp_path / "drive.npz", *named)[0].name == "ackermann"
 
 
-def test_poses_far_from_the_origin_of_a_fast_car_are_read(tmp_path, columns):
+def test_poses_far_from_the_origin_of_a_fast_car_are_read(log, columns):
     moved = {"x": 60.0 * columns["x"] + 4e5, "y": 60.0 * columns["y"] + 5e6}
-    path = write(tmp_path / "log.csv", columns | moved)
+    path = log(moved)
     found = read(path, "robot: {kind: ackermann_throttle, footprint_radius: 2.0}")
     assert np.allclose(np.diff(found.pose.values[:, 0]), np.diff(moved["x"]), atol=1e-6)
 
 
-def test_longitude_and_latitude_are_places_on_the_ground(tmp_path, columns):
+def test_longitude_and_latitude_are_places_on_the_ground(log, columns):
     # 111.2 km to a degree of latitude at 48 degrees north, 74.6 km of longitude
     far = {
         "lon": 11.5 + columns["x"] / 74.626e3,
         "lat": 48.0 + columns["y"] / 111.197e3,
     }
-    path = write(tmp_path / "log.csv", columns | far)
+    path = log(far)
     pose = "pose: {x: lon, y: %s, heading: yaw, unit: deg}"
     found = read(path, pose % "lat").pose.values[:, :2]
     moved = np.stack([columns["x"], columns["y"]], axis=1)
@@ -339,10 +345,8 @@ def test_longitude_and_latitude_are_places_on_the_ground(tmp_path, columns):
         ("ticks, differentiate: false", "add `ticks_per_turn:`"),
     ],
 )
-def test_a_unit_of_another_kind_than_the_command_s_is_refused(
-    tmp_path, columns, unit, says
-):
-    path = write(tmp_path / "log.csv", columns)
+def test_a_unit_of_another_kind_than_the_command_s_is_refused(log, unit, says):
+    path = log()
     changes = """
         robot: {kind: ackermann, footprint_radius: 0.2, parameters: {wheelbase: 0.3}}
         command:

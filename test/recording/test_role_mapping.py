@@ -66,7 +66,7 @@ TURNING = CAR.model_copy(update={"angular_is": "turn_rate"})
     ],
 )
 def test_every_kind_of_command_is_read(tmp_path, kind, storage, spec, angle):
-    command = [(t, COMMANDS[kind](t)) for t in bags.times(0.1)]
+    command = bags.every(0.1, COMMANDS[kind])
     topics = {"/cmd_vel": command, "/pose": bags.poses()}
     recording = read(tmp_path, topics, spec, storage)
     assert np.allclose(recording.command.values, [0.5, angle])
@@ -75,7 +75,7 @@ def test_every_kind_of_command_is_read(tmp_path, kind, storage, spec, angle):
 
 @pytest.mark.parametrize("kind", POSES)
 def test_every_kind_of_pose_is_read(tmp_path, kind):
-    pose = [(t, POSES[kind](t, *bags.place_at(t))) for t in bags.times()]
+    pose = bags.along(POSES[kind])
     topics = {"/cmd_vel": bags.commands(), "/where": pose}
     recording = read(tmp_path, topics, pose="/where")
     assert np.allclose(recording.pose.values[:, :2], PLACES[:, :2])
@@ -98,7 +98,7 @@ def test_a_mapping_may_name_a_topic_of_commands(tmp_path):
 
 
 def test_steering_angles_are_refused_for_a_robot_that_has_none(tmp_path):
-    command = [(t, bags.ackermann(0.5, 0.1)) for t in bags.times(0.1)]
+    command = bags.every(0.1, COMMANDS["AckermannDrive"])
     topics = {"/cmd_vel": command, "/pose": bags.poses()}
     assert "holds steering angles" in refused(tmp_path, topics, CART)
 
