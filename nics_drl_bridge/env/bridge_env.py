@@ -281,13 +281,18 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         self._steps += 1
         direct = self._direct
-        if direct is not None:
-            if not direct.try_action(action):
-                direct.commands[...] = self._make_commands(action)
-            self._commands = direct.commands
-            observation, terms, ended, info = direct.advance(self.memory)
-            self.ended[0] = ended
-            return observation, terms, info
+        if direct is None:
+            return self._advance_backend(before, action)
+        if not direct.try_action(action):
+            direct.commands[...] = self._make_commands(action)
+        self._commands = direct.commands
+        observation, terms, self.ended[0], info = direct.advance(self.memory)
+        return observation, terms, info
+
+    def _advance_backend(
+        self, before: RobotView, action: AnyArray
+    ) -> tuple[Singles, dict[str, Any], Info]:
+        """Advances through the methods of backend and task, after the view `before`."""
         self._commands = self._make_commands(action)
         measured, facts = self._backend.step(self._commands[self._row])
         self._facts = facts

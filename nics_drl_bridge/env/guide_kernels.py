@@ -70,59 +70,62 @@ def find_ways(
 
     For the worlds (n,): member (n,), bodies (n, K, 7), goals (n, M, 2).
     """
-    rows = grid.walls.shape[1]
-    columns = grid.walls.shape[2]
-    gaps = np.empty((rows, columns), np.float32)
+    gaps = np.empty(grid.walls.shape[1:], np.float32)
     for n in range(len(worlds)):
         p = member[n]
         height = grid.sizes[p, 0]
         width = grid.sizes[p, 1]
         space = gaps[:height, :width]
         space[...] = grid.walls[p, :height, :width]
-        x = grid.frames[p, 0]
-        y = grid.frames[p, 1]
-        cell = grid.frames[p, 2]
+        frame = grid.frames[p]
         for k in range(bodies.shape[1]):
             if grid.stands[p, k] and bodies[n, k, RADIUS] > 0.0:
-                _lower_space(space, bodies[n, k], x, y, cell, grid)
+                _lower_space(space, bodies[n, k], frame, grid)
         for i in range(height):
             for j in range(width):
-                cost = _find_cost(space[i, j], grid)
-                space[i, j] = np.float32(cell * cost)
+                space[i, j] = np.float32(frame[2] * _find_cost(space[i, j], grid))
         for m in range(goals.shape[1]):
-            field = out[worlds[n], m, :height, :width]
-            u = (goals[n, m, 0] - x) / cell - 0.5
-            v = (goals[n, m, 1] - y) / cell - 0.5
-            _spread(field, space, u, v)
+            _spread(out[worlds[n], m, :height, :width], space, goals[n, m], frame)
+
+
+@kernel
+def _locate(place: Array, frame: Array) -> tuple[float, float]:
+    """Return column and row of a place x, y, as fractions."""
+    u = (place[0] - frame[0]) / frame[2] - 0.5
+    return u, (place[1] - frame[1]) / frame[2] - 0.5
 
 
 @kernel
 def _lower_space(
     space: Singles,
     body: Array,
-    x: float,
-    y: float,
-    cell: float,
+    frame: Array,
     grid: GuideGrid,
 ) -> None:
     """Lower the clearance (rows, columns) of cells to the distance from a body [m]."""
+    cell = frame[2]
     far = body[RADIUS] + grid.outer + COMFORT
-    first = max(int((body[Y] - far - y) / cell), 0)
-    last = min(int((body[Y] + far - y) / cell), len(space) - 1)
-    left = max(int((body[X] - far - x) / cell), 0)
-    right = min(int((body[X] + far - x) / cell), space.shape[1] - 1)
-    outline = collision.outline_of(body, grid.outlines)
+    first = max(int((body[Y] - far - frame[1]) / cell), 0)
+    last = min(int((body[Y] + far - frame[1]) / cell), len(space) - 1)
+    left = max(int((body[X] - far - frame[0]) / cell), 0)
+    right = min(int((body[X] + far - frame[0]) / cell), space.shape[1] - 1)
     for i in range(first, last + 1):
-        dy = y + (i + 0.5) * cell - body[Y]
+        dy = frame[1] + (i + 0.5) * cell - body[Y]
         for j in range(left, right + 1):
-            dx = x + (j + 0.5) * cell - body[X]
-            if outline.begin < outline.end:
-                along = body[COS] * dx + body[SIN] * dy
-                across = body[COS] * dy - body[SIN] * dx
-                gap = collision.outline_point(along, across, outline)
-            else:
-                gap = math.sqrt(dx * dx + dy * dy) - body[RADIUS]
+            dx = frame[0] + (j + 0.5) * cell - body[X]
+            gap = _measure_gap(dx, dy, body, grid.outlines)
             space[i, j] = min(space[i, j], np.float32(gap))
+
+
+@kernel
+def _measure_gap(dx: float, dy: float, body: Array, outlines: OutlineArrays) -> float:
+    """Distance from a body, negative inside, at a displacement from its origin [m]."""
+    outline = collision.outline_of(body, outlines)
+    if outline.begin == outline.end:
+        return math.sqrt(dx * dx + dy * dy) - body[RADIUS]
+    along = body[COS] * dx + body[SIN] * dy
+    across = body[COS] * dy - body[SIN] * dx
+    return collision.outline_point(along, across, outline)
 
 
 @kernel
@@ -140,8 +143,9 @@ def _find_cost(space: float, grid: GuideGrid) -> float:
 
 
 @kernel
-def _spread(field: Singles, cost: Singles, u: float, v: float) -> None:
-    """Arrival times of a front that starts at column u, row v (fractions) and takes `cost`."""
+def _spread(field: Singles, cost: Singles, start: Array, frame: Array) -> None:
+    """Write the arrival times of a front that starts at x, y and takes `cost` per cell."""
+    u, v = _locate(start, frame)
     rows, columns = field.shape
     field[...] = np.inf
     gi = min(max(round(v), 0), rows - 1)
@@ -170,26 +174,25 @@ def update_ways(ways: Singles, prices: Singles, down: bool, left: bool) -> np.fl
         i = rows - 1 - a if down else a
         for b in range(columns):
             j = columns - 1 - b if left else b
-            left_way = ways[i, max(j - 1, 0)]
-            right_way = ways[i, min(j + 1, columns - 1)]
-            below = ways[max(i - 1, 0), j]
-            over = ways[min(i + 1, rows - 1), j]
-            beside = min(left_way, right_way)
-            above = min(below, over)
-            price = prices[i, j]
-            apart = beside - above
-            least = min(beside, above)
-            if not least < ways[i, j]:
+            beside = min(ways[i, max(j - 1, 0)], ways[i, min(j + 1, columns - 1)])
+            above = min(ways[max(i - 1, 0), j], ways[min(i + 1, rows - 1), j])
+            if not min(beside, above) < ways[i, j]:
                 continue
-            way = least + price
-            if abs(apart) < price:
-                square = np.float32(2.0) * price * price - apart * apart
-                way = np.float32(0.5) * (beside + above + math.sqrt(square))
+            way = _cross_cell(beside, above, prices[i, j])
             if way < ways[i, j]:
-                change = min(ways[i, j] - way, np.float32(1e3))
-                most = max(most, change)
+                most = max(most, min(ways[i, j] - way, np.float32(1e3)))
                 ways[i, j] = way
     return most
+
+
+@kernel(inline=True)
+def _cross_cell(beside: np.float32, above: np.float32, price: np.float32) -> np.float32:
+    """Return when the front reaches a cell, from when it reached its neighbours."""
+    apart = beside - above
+    if abs(apart) < price:  # it comes obliquely
+        square = np.float32(2.0) * price * price - apart * apart
+        return np.float32(0.5) * (beside + above + math.sqrt(square))
+    return min(beside, above) + price
 
 
 @kernel
@@ -203,22 +206,20 @@ def measure_lengths(
     """Write the path lengths (N, M) [m] from poses (N, M, 3), interpolated linearly."""
     for n in range(len(out)):
         p = member[n]
-        x = grid.frames[p, 0]
-        y = grid.frames[p, 1]
-        cell = grid.frames[p, 2]
-        rows = grid.sizes[p, 0]
-        columns = grid.sizes[p, 1]
         for m in range(out.shape[1]):
-            u = (poses[n, m, 0] - x) / cell - 0.5
-            v = (poses[n, m, 1] - y) / cell - 0.5
-            u = min(max(u, 0.0), columns - 1.000001)
-            v = min(max(v, 0.0), rows - 1.000001)
-            i = int(v)
-            j = int(u)
-            s = v - i
-            t = u - j
-            row = fields[n, m, i]
-            next_row = fields[n, m, i + 1]
-            below = (1.0 - t) * row[j] + t * row[j + 1]
-            above = (1.0 - t) * next_row[j] + t * next_row[j + 1]
-            out[n, m] = (1.0 - s) * below + s * above
+            u, v = _locate(poses[n, m], grid.frames[p])
+            u = min(max(u, 0.0), grid.sizes[p, 1] - 1.000001)
+            v = min(max(v, 0.0), grid.sizes[p, 0] - 1.000001)
+            out[n, m] = _interpolate(fields[n, m], u, v)
+
+
+@kernel
+def _interpolate(field: Singles, u: float, v: float) -> float:
+    """Return the value at column u and row v (fractions), between the cells around it."""
+    i = int(v)
+    j = int(u)
+    s = v - i
+    t = u - j
+    below = (1.0 - t) * field[i, j] + t * field[i, j + 1]
+    above = (1.0 - t) * field[i + 1, j] + t * field[i + 1, j + 1]
+    return (1.0 - s) * below + s * above

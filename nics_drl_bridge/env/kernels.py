@@ -101,7 +101,7 @@ def has_contact(ranges: Singles, scale: ScanScale) -> bool:
     """Returns True if a beam (B,), and its mean with its neighbours, end in the footprint.
 
     A single beam is too noisy: among hundreds, one is nearly always off by three
-        standard deviations.
+    standard deviations.
     """
     count = len(ranges)
     for begin in range(0, count, BLOCK):

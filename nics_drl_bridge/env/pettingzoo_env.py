@@ -131,9 +131,8 @@ class BridgeParallelEnv(ParallelEnv[str, Singles, AnyArray]):
         seen = {}
         for name in self.agents:
             m = self.possible_agents.index(name)
-            paid = {key: float(term[m]) for key, term in terms.items()}
-            infos[name] = self._of(info, m)
-            infos[name]["reward_terms"] = paid
+            paid = {key: float(terms[key][m]) for key in terms}
+            infos[name] = {**self._of(info, m), "reward_terms": paid}
             rewards[name] = sum(paid.values())
             ended[name] = bool(self.env.ended[m])
             seen[name] = observation[m]

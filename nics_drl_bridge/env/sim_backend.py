@@ -36,11 +36,11 @@ def _decode_pose(pose: Array) -> Array:
 class SimBackend:
     """One world of the fast simulator, in this process.
 
-    With `estimator`, each robot's scan and odometry pass through its middleware, as in the nodes,
-    so that this backend and the DDS backend return the same numbers. Without it, poses
-        come from odometry: results are bit-identical to the vector env, and several
-        times as fast. Views and
-    commands have a leading (M,) for M > 1 `robots`; `simulation` is passed to the FastSimulator.
+    With `estimator`, each robot's scan and odometry pass through its middleware, as in
+    the nodes, so that this backend and the DDS backend return the same numbers. Without
+    it, poses come from odometry: results are bit-identical to the vector env, and
+    several times as fast. Views and commands have a leading (M,) for M > 1 `robots`;
+    `simulation` is passed to the FastSimulator.
     """
 
     @check_arguments("backend 'sim'", FastSimulator, without=("worlds",))

@@ -67,16 +67,15 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
 
     ## Arguments
 
-    `num_envs` is N; `model` (or `robot`), `world`, `task`, `task_options` are those of `BridgeEnv`.
-    An episode is truncated after `max_episode_steps`. `autoreset_mode` is `NextStep` (an ended
-    world is reset in the next step, which ignores its action) or `SameStep`
-    (immediately; the last observation is in `info["final_obs"]`). With `copy=True` the
-    caller may keep what `step` returns; with False the next step reuses the observation
-    array. `render_mode` is `rgb_array`, of every world, or None. Other arguments are
-        those of the FastSimulator: `renderer` (`baked` by default, or `exact`),
-        `threads`,
-    which does not affect the results, and `randomisation`, see `BridgeEnv`. Raises
-    ConfigError or ModelError for an unknown name or a wrong file.
+    `num_envs` is N; `model` (or `robot`), `world`, `task`, `task_options` are those of
+    `BridgeEnv`. An episode is truncated after `max_episode_steps`. `autoreset_mode` is
+    `NextStep` (an ended world is reset in the next step, which ignores its action) or
+    `SameStep` (immediately; the last observation is in `info["final_obs"]`). With
+    `copy=True` the caller may keep what `step` returns; with False the next step reuses
+    the observation array. `render_mode` is `rgb_array`, of every world, or None. Other
+    arguments are those of the FastSimulator: `renderer` (`baked` by default, or
+    `exact`), `threads`, which does not affect the results, and `randomisation`, see
+    `BridgeEnv`. Raises ConfigError or ModelError for an unknown name or a wrong file.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own declaration
@@ -110,10 +109,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         self.render_mode = render_mode
         self._limit = max_episode_steps
         self.copy = copy
-        if isinstance(autoreset_mode, AutoresetMode):
-            mode = autoreset_mode.value
-        else:
-            mode = autoreset_mode
+        mode = getattr(autoreset_mode, "value", autoreset_mode)
         if not isinstance(mode, str) or mode not in MODES:
             raise ConfigError(
                 f"autoreset_mode {format_value(mode)}: must be one of {', '.join(MODES)}."
@@ -295,7 +291,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
 
     @guard.refuse_after_close
     def step(self, actions: AnyArray) -> tuple[Observation, Array, Flags, Flags, Info]:
-        """Advances every world by one control period; see Gymnasium."""
+        """Advances every world by one control period; see Gymnasium.
+
+        Each thread advances its part of the worlds, see `_advance`. Worlds whose episode
+        is over then begin another: at once in `SameStep`, in the next step in `NextStep`.
+        """
         if not self.ready:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         given = guard.check_action(actions, self.action_space, "actions").reshape(
@@ -303,8 +303,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         )
         self.ready = False
         out = np.empty_like(self._out) if self.copy else self._out
-        # In `NextStep`, worlds whose episode was over begin another. They are stepped with the
-        # others, and the outcome is dropped.
+        # Worlds that begin another episode are stepped with the others; their outcome is dropped.
         resetting = self._awaits_reset.copy()
         run = self.simulator.run_parts
         outcome = join_outcomes(
@@ -349,6 +348,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
     def _advance(
         self, part: slice, actions: AnyArray, out: Observation, resetting: Flags
     ) -> Outcome:
+        """Moves the worlds of a part, lets the task judge the step, and begins due episodes."""
         data = self.simulator.data
         ended = self.ended[part]
         command = self.task.drive(actions, ended)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -89,46 +90,69 @@ def make_grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> 
     """Compute the cells of a shape and the widths of their rows."""
     shape = outlines.shapes[h]
     radius = outlines.radii[h]
-    order = outlines.orders[h]
     distances = np.linspace(radius, spec.range_max + radius, density.distances)
     distances[0] *= 1.0 + TOUCHING
     is_round = isinstance(shape, Circle)
-    if is_round:
-        count = 1
-        round_radius = radius
-    else:
-        count = max(1, math.ceil(density.rotations / order))
-        round_radius = 0.0
-    unit = 2.0 * np.pi / (count * order)
-    hull = outlines.hulls[
-        outlines.hull[h] : (outlines.hull[h] + outlines.hull[h + 1]) // 2
-    ]
-    parts = 2 * max(1, math.ceil(unit / COARSE))
-    turns = np.arange(-parts // 2, parts * count - parts // 2 + 1) * unit / parts
-    edges = np.zeros((len(turns), density.distances, 2))
-    hints = np.zeros(edges.shape, np.int64)
-    bake_kernels.find_edges(hull, round_radius, distances, turns, edges, hints)
+    count = 1
+    if not is_round:
+        count = max(1, math.ceil(density.rotations / outlines.orders[h]))
+    unit = 2.0 * np.pi / (count * outlines.orders[h])
+    fine = _find_fine_edges(outlines, h, distances, unit, count)
     cell = np.zeros((count, density.distances, 6), np.int64)
-    low = _reach_of(edges[..., 0], parts, np.minimum) / spec.angle_increment
-    high = _reach_of(edges[..., 1], parts, np.maximum) / spec.angle_increment
+    low = _reach_of(fine.edges[..., 0], fine.parts, np.minimum) / spec.angle_increment
+    high = _reach_of(fine.edges[..., 1], fine.parts, np.maximum) / spec.angle_increment
     cell[..., 0] = np.floor(low - 0.5)
     cell[..., 1] = np.ceil(high + 0.5) - cell[..., 0] + 1
-    for side in () if is_round else (0, 1):
-        edge = edges[..., side]
-        wound = _wound(hull, hints[..., side], edge - turns[:, None] + side * np.pi)
-        two, climb = _choose_corners(wound, parts, len(hull))
-        miss = _miss(hull, two, edge, turns, distances, parts)
-        far_off = miss > MISS * spec.angle_increment
-        # close to contact, the border of a cell does not bound its interior
-        far_off[:, 0] = True
-        corners = np.where(far_off[..., None], climb, two)
-        cell[..., 2 + 2 * side : 4 + 2 * side] = corners
+    if not is_round:
+        cell[..., 2:4] = _find_corners(fine, 0, spec.angle_increment)
+        cell[..., 4:] = _find_corners(fine, 1, spec.angle_increment)
     if cell[..., 1].max() > MOST_WIDE or cell[..., 0].min() < FIRST_BEAM:
         raise ConfigError(
             f"{describe(shape)} covers too many beams to be baked: they are "
             f"{spec.angle_increment:.2g} rad apart; scan with the renderer `exact`."
         )
-    return Grid(distances, np.arange(count) * unit, edges[parts // 2 :: parts], cell)
+    edges = fine.edges[fine.parts // 2 :: fine.parts]
+    return Grid(distances, np.arange(count) * unit, edges, cell)
+
+
+class _FineEdges(NamedTuple):
+    """Edges of a shape, at `parts` rotations in each of the table's, and at its distances."""
+
+    hull: Array  # (V, 2) corners [m]
+    distances: Array  # (D,) [m]
+    parts: int
+    turns: Array  # (T parts + 1,) rotations [rad]
+    edges: Array  # (T parts + 1, D, 2) right and left edge [rad]
+    corners: Integers  # (T parts + 1, D, 2) of the hull, at the edges
+
+
+def _find_fine_edges(
+    outlines: Outlines, h: int, distances: Array, unit: float, count: int
+) -> _FineEdges:
+    """Find the edges of shape h for `count` grid rotations, a `unit` apart [rad]."""
+    begin = outlines.hull[h]
+    hull = outlines.hulls[begin : (begin + outlines.hull[h + 1]) // 2]
+    round_radius = 0.0
+    if isinstance(outlines.shapes[h], Circle):
+        round_radius = outlines.radii[h]
+    parts = 2 * max(1, math.ceil(unit / COARSE))
+    turns = np.arange(-parts // 2, parts * count - parts // 2 + 1) * unit / parts
+    edges = np.zeros((len(turns), len(distances), 2))
+    corners = np.zeros(edges.shape, np.int64)
+    bake_kernels.find_edges(hull, round_radius, distances, turns, edges, corners)
+    return _FineEdges(hull, distances, parts, turns, edges, corners)
+
+
+def _find_corners(fine: _FineEdges, side: int, beam_angle: float) -> Integers:
+    """Return the corners (T, D, 2) for the right (0) or left (1) edge, see `LidarTable`."""
+    edge = fine.edges[..., side]
+    along = edge - fine.turns[:, None] + side * np.pi
+    wound = _wound(fine.hull, fine.corners[..., side], along)
+    two, climb = _choose_corners(wound, fine.parts, len(fine.hull))
+    far_off = _miss(fine, two, edge) > MISS * beam_angle
+    # close to contact, the border of a cell does not bound its interior
+    far_off[:, 0] = True
+    return np.where(far_off[..., None], climb, two)
 
 
 def _reduce_cells(values: AnyArray, parts: int, outer: np.ufunc) -> AnyArray:
@@ -177,24 +201,17 @@ def _choose_corners(
     return two, np.stack([first % corners, -stride], axis=-1)
 
 
-def _miss(
-    hull: Array,
-    two: Integers,
-    edge: Array,
-    turns: Array,
-    distances: Array,
-    parts: int,
-) -> Array:
+def _miss(fine: _FineEdges, two: Integers, edge: Array) -> Array:
     """Error (T, D) of the better of two corners at the border of a cell [rad]."""
-    count = len(two)
+    parts = fine.parts
     worst = np.zeros(two.shape[:2])
     for k in range(parts + 1):
-        turn = turns[k:][: count * parts : parts]
-        true = edge[k:][: count * parts : parts]
-        corner = rotate(hull[two], turn[:, None, None])
+        turn = fine.turns[k:][: len(two) * parts : parts]
+        true = edge[k:][: len(two) * parts : parts]
+        corner = rotate(fine.hull[two], turn[:, None, None])
         for later in (0, 1):
-            last = len(distances) - later
-            x = corner[:, :last, :, 0] + distances[later:, None]
+            last = len(fine.distances) - later
+            x = corner[:, :last, :, 0] + fine.distances[later:, None]
             off = np.abs(
                 np.arctan2(corner[:, :last, :, 1], x) - true[:, later:, None]
             ).min(axis=-1)

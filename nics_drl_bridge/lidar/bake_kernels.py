@@ -13,10 +13,10 @@ from nics_drl_bridge.lidar.exact_kernels import (
     scan_circle,
     scan_polygon,
 )
+from nics_drl_bridge.lidar.lookup_kernels import LEFT, RIGHT
 
-EDGE = (
-    1e-6  # ranges at an edge are taken this far inside it, as a fraction of the width
-)
+# ranges at an edge are taken this far inside it, as a fraction of the width
+EDGE = 1e-6
 
 
 @kernel
@@ -42,25 +42,26 @@ def find_edges(
                 edges[t, d, 0] = -half
                 edges[t, d, 1] = half
                 continue
-            rx, ry = place_corner(distances[d], 0.0, c, s, hull[0])
-            lx = rx
-            ly = ry
-            right = 0
-            left = 0
-            for v in range(1, len(hull)):
-                x, y = place_corner(distances[d], 0.0, c, s, hull[v])
-                if rx * y - ry * x < 0.0:
-                    rx = x
-                    ry = y
-                    right = v
-                if lx * y - ly * x > 0.0:
-                    lx = x
-                    ly = y
-                    left = v
-            edges[t, d, 0] = math.atan2(ry, rx)
-            edges[t, d, 1] = math.atan2(ly, lx)
-            hints[t, d, 0] = right
-            hints[t, d, 1] = left
+            for k, side in enumerate((RIGHT, LEFT)):
+                edges[t, d, k], hints[t, d, k] = _find_edge(
+                    distances[d], c, s, hull, side
+                )
+
+
+@kernel
+def _find_edge(
+    distance: float, c: float, s: float, hull: Array, side: float
+) -> tuple[float, int]:
+    """Return the direction of the outermost corner on a side [rad], and its index."""
+    outer_x, outer_y = place_corner(distance, 0.0, c, s, hull[0])
+    corner = 0
+    for v in range(1, len(hull)):
+        x, y = place_corner(distance, 0.0, c, s, hull[v])
+        if side * (outer_x * y - outer_y * x) < 0.0:
+            outer_x = x
+            outer_y = y
+            corner = v
+    return math.atan2(outer_y, outer_x), corner
 
 
 class ShapeAhead(NamedTuple):

@@ -87,12 +87,19 @@ def distort(
             ranges[i] = _report(ranges[i], _quantize(ranges[i], device), device)
     if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
         by = random.key(seed, random.DROPOUT_STREAM, counter)
-        share = np.float32(faults[DROPOUT])
-        far = np.float32(faults[DROPOUT_FAR] / (limits[1] * limits[1]))
-        for i in range(len(ranges)):
-            reach = ranges[i] if ranges[i] > np.float32(0.0) else np.float32(0.0)
-            lost = random.share_of(random.bits(by, i)) < share + far * reach * reach
-            whole[i] = max(whole[i], INF if lost else NONE)
+        _drop_returns(ranges, limits[1], faults, by)
+
+
+@kernel(inline=True)
+def _drop_returns(ranges: Singles, range_max: float, faults: Array, by: int) -> None:
+    """Lose returns at random; far ones are lost more often."""
+    whole = ranges.view(np.int32)
+    share = np.float32(faults[DROPOUT])
+    far = np.float32(faults[DROPOUT_FAR] / (range_max * range_max))
+    for i in range(len(ranges)):
+        reach = ranges[i] if ranges[i] > np.float32(0.0) else np.float32(0.0)
+        lost = random.share_of(random.bits(by, i)) < share + far * reach * reach
+        whole[i] = max(whole[i], INF if lost else NONE)
 
 
 @kernel(inline=True)

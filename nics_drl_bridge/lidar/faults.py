@@ -28,12 +28,11 @@ class LidarFaults(Schema):
     """The faults of a device, in addition to the `noise_std` of its LidarSpec.
 
     They are applied in this order: skew, geometry, too_close, noise, quantisation,
-        dropout. With skew, the device turns while the robot moves, and its newest beam
-        is measured at the time of the scan; without skew, all beams are measured at
-        once. A return nearer than range_min is reported as `-inf` (REP-117), as
-        `range_min`, as no return, or as a `ghost` at a random range within the limits.
-        `dropout_far` grows with the square of the range up to its full value at
-        range_max.
+    dropout. With skew, the device turns while the robot moves, and its newest beam is
+    measured at the time of the scan; without skew, all beams are measured at once. A
+    return nearer than range_min is reported as `-inf` (REP-117), as `range_min`, as no
+    return, or as a `ghost` at a random range within the limits. `dropout_far` grows
+    with the square of the range up to its full value at range_max.
     """
 
     # direction in which the device turns while the robot moves; none: all beams at once
@@ -57,16 +56,14 @@ class LidarFaults(Schema):
 
     def parameters(self, noise_std: float) -> Array:
         """Return the kernels' row (P,), in the order of the columns in `fault_kernels`."""
-        too_close = TOO_CLOSE[self.too_close]
-        skew = SKEW[self.skew]
         return np.array(
             [
                 noise_std,
                 self.noise_proportional,
                 self.dropout,
                 self.dropout_far,
-                too_close,
+                TOO_CLOSE[self.too_close],
                 self.quantisation,
-                skew,
+                SKEW[self.skew],
             ]
         )

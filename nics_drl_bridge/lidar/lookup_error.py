@@ -55,44 +55,63 @@ def find_lookup_distances(
 ) -> tuple[float, float]:
     """Find the distances between which looking up a shape has an RMSE of at most `greatest` [m].
 
-    This must hold in each ring of distances and in each band of ranges over all rings,
-        and no beam may be off by more than `OUTLIER`: long thin shapes have large
-        errors when they are near and seen edge-on, distant ones where a beam grazes
-        them. Only beams with a return in both scans count, because which beams hit is
-        exact. Placements
-    are the same for all shapes. `exact` and `baked` are `Scanner.arguments` of these renderers, the
-    shape is an index in the table with its radius [m]. Returns the minimum and the maximum distance
-    to its origin [m]; both inf if it may not be looked up.
+    Long thin shapes have large errors when they are near and seen edge-on, distant ones
+    where a beam grazes them. Only beams with a return in both scans count, because which
+    beams hit is exact. Placements are the same for all shapes.
+
+    Args:
+        exact: `Scanner.arguments` of this renderer.
+        baked: the same of this one.
+        shape: index in the table.
+        radius: of the shape [m].
+        greatest: RMSE [m].
+
+    Returns:
+        The minimum and the maximum distance to the shape's origin [m]; both inf if it
+        may not be looked up.
     """
-    corners, first = exact.outlines
-    outline = corners[first[shape] : first[shape + 1]]
-    nearest = TOUCHING * exact.range_max
-    edges = np.geomspace(nearest, exact.range_max, RINGS)
+    edges = np.geomspace(TOUCHING * exact.range_max, exact.range_max, RINGS)
     rings = np.concatenate([[0.0], edges]) + radius
-    lowest = max(exact.range_min, nearest)
-    limits = np.geomspace(lowest, exact.range_max, BANDS + 1)
-    squares = np.zeros((RINGS, PLACES, BANDS))
-    counts = np.zeros((RINGS, PLACES, BANDS))
-    worst = np.zeros(RINGS)
-    for i in range(RINGS):
-        poses = _place_around(exact, rings[i : i + 2], SEED + i)
-        errors = _compare(place(poses[:, None], radius, shape), exact, baked)
-        squares[i], counts[i] = _sum_by_band(errors, limits[1:-1])
-        worst[i] = np.abs(errors.error).max(initial=0.0)
-        if len(outline) > 0:
-            poses = _turn_edge_on(poses, outline, SEED + i)
-            errors = _compare(place(poses[:, None], radius, shape), exact, baked)
-            worst[i] = max(worst[i], np.abs(errors.error).max(initial=0.0))
-    # The widest interval of rings with small errors, if one is wide enough.
+    sums = _sample_rings(rings, exact, baked, shape, radius)
     best = (np.inf, np.inf)
     width = NARROWEST * (rings[-1] - rings[0])
     for i, j in combinations(range(RINGS + 1), 2):
-        if rings[j] - rings[i] <= width or worst[i:j].max() > OUTLIER:
+        if rings[j] - rings[i] <= width or sums.worst[i:j].max() > OUTLIER:
             continue
-        if _is_small(squares[i:j], counts[i:j], greatest):
+        if _is_small(sums.squares[i:j], sums.counts[i:j], greatest):
             best = (float(rings[i]), float(rings[j]))
             width = rings[j] - rings[i]
     return best
+
+
+class _Sums(NamedTuple):
+    """Errors by ring, placement and band of range."""
+
+    squares: Array  # (R, P, B) sums of squared errors [m^2]
+    counts: Array  # (R, P, B) numbers of beams
+    worst: Array  # (R,) largest error of any beam [m]
+
+
+def _sample_rings(
+    rings: Array, exact: LidarArrays, baked: LidarArrays, shape: int, radius: float
+) -> _Sums:
+    """Scan a shape at random places in rings (R + 1,) by both renderers, and edge-on."""
+    corners, first = exact.outlines
+    outline = corners[first[shape] : first[shape + 1]]
+    lowest = max(exact.range_min, TOUCHING * exact.range_max)
+    limits = np.geomspace(lowest, exact.range_max, BANDS + 1)
+    by_band = np.zeros((2, RINGS, PLACES, BANDS))
+    sums = _Sums(by_band[0], by_band[1], np.zeros(RINGS))
+    for i in range(RINGS):
+        poses = _place_around(exact, rings[i : i + 2], SEED + i)
+        errors = _compare(place(poses[:, None], radius, shape), exact, baked)
+        by_band[:, i] = _sum_by_band(errors, limits[1:-1])
+        sums.worst[i] = np.abs(errors.error).max(initial=0.0)
+        if len(outline) > 0:
+            poses = _turn_edge_on(poses, outline, SEED + i)
+            errors = _compare(place(poses[:, None], radius, shape), exact, baked)
+            sums.worst[i] = np.abs(errors.error).max(initial=sums.worst[i])
+    return sums
 
 
 class _Errors(NamedTuple):

@@ -101,9 +101,12 @@ def find_free_squares(blocked: Mask) -> NDArray[np.uint32]:
             for j in range(columns):
                 column = columns - j if right > 0 else j + 1
                 if not blocked[row - 1, column - 1]:
-                    beyond = min(side[row + up, column], side[row, column + right])
-                    least = min(beyond, side[row + up, column + right]) + 1
-                    side[row, column] = min(least, LONGEST)
+                    least = min(
+                        side[row + up, column],
+                        side[row, column + right],
+                        side[row + up, column + right],
+                    )
+                    side[row, column] = min(least + 1, LONGEST)
                     squares[row, column] |= np.uint32(side[row, column]) << np.uint32(
                         8 * quadrant
                     )

@@ -45,8 +45,6 @@ class GridMap:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # True: cells that are neither free nor occupied stop a beam
     unknown_stops: bool = False
-    # minimum value of occupied cells; 100 as in Nav2's static layer
-    occupied_from: int = OCCUPIED
 
     @cached_property
     def free(self) -> Mask:
@@ -58,7 +56,7 @@ class GridMap:
         """(rows, columns) cells that stop a beam."""
         if self.unknown_stops:
             return ~self.free
-        return self.cells >= self.occupied_from
+        return np.asarray(self.cells >= OCCUPIED)
 
     @cached_property
     def arrays(self) -> map_kernels.GridArrays:
@@ -158,9 +156,7 @@ class MapFile(Schema):
         return self
 
 
-def load_map(
-    name: str | Path, unknown_stops: bool = False, occupied_from: int = OCCUPIED
-) -> GridMap:
+def load_map(name: str | Path) -> GridMap:
     """Load a shipped map by name (`room`), or any other by the path of its YAML file.
 
     Cells equal those of Nav2's map_server: pixels exactly on a threshold are occupied or free,
@@ -174,7 +170,7 @@ def load_map(
     if opaque is not None and file.mode != "raw":
         cells[~opaque] = UNKNOWN
     cells = np.ascontiguousarray(cells[::-1])
-    return GridMap(cells, file.resolution, file.origin, unknown_stops, occupied_from)
+    return GridMap(cells, file.resolution, file.origin)
 
 
 def files_of(name: str | Path) -> tuple[Path, Path]:

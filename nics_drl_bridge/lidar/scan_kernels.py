@@ -170,10 +170,14 @@ def scan_robot(
             scratch.singles,
             scratch.integers,
         )
-    # Ranges that are too far become `inf`, those too close `-inf` (REP-117).
+    _write_ranges(ranges, scan.view(np.float32), lidar)
+
+
+@kernel(inline=True)
+def _write_ranges(ranges: Singles, distances: Singles, lidar: LidarArrays) -> None:
+    """Write a scan (B,): `inf` for what is too far, `-inf` for what is too close (REP-117)."""
     low = np.float32(lidar.range_min)
     high = np.float32(lidar.range_max)
-    distances = scan.view(np.float32)
     for b in range(len(ranges)):
         beam = np.uintp(b)
         value = distances[beam]

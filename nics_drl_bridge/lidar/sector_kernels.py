@@ -75,20 +75,15 @@ def _fill_by_place(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
             out[s] = _choose_nearer(out[s], value[b])
     around = round(TURN / plan.width)
     for b in range(beams if plan.closed else beams - 1):
-        after = b + 1
-        if after == beams:
-            after = 0
+        after = (b + 1) % beams
         if where[b] < 0 or where[after] < 0:
             continue
         gap = (where[after] - where[b]) % around
-        step = 1
         if gap > around // 2:  # the other direction is shorter
-            step = -1
-            gap = around - gap
+            gap -= around
         near = min(value[b], value[after])
-        s = where[b]
-        for _ in range(gap - 1):
-            s = (s + step) % around
+        for k in range(1, abs(gap)):
+            s = (where[b] + (k if gap > 0 else -k)) % around
             if s < sectors and not has_return[s]:
                 out[s] = _choose_nearer(out[s], near)
 

@@ -51,8 +51,8 @@ class Sensor(Schema, ABC):
     """A sensor of a robot in addition to its lidar.
 
     A subclass is found by its `kind`: the name of an entry point in
-        `nics_drl_bridge.sensors`, or of a class imported by `add_sensor_kind`. A
-        reading is S float32 numbers; NaN means unknown.
+    `nics_drl_bridge.sensors`, or of a class imported by `add_sensor_kind`. A reading is
+    S float32 numbers; NaN means unknown.
     """
 
     # message type, such as sensor_msgs/msg/LaserScan; it must have a header

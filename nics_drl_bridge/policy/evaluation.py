@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium
@@ -125,45 +125,66 @@ def drive(
     """Runs one episode to its end; halts the robot if the policy or a callback raises."""
     try:
         steps = _drive_steps(env, policy, seed, options, on_start)
-        _, _, info_at_start = next(steps)
-        goal = info_at_start.get("goal")
-        if goal is None:  # a user's task may not expose its goal
-            goal = env.get_wrapper_attr("scene").goals[0]
-        info = info_at_start
-        paths = [info["start"]]
-        estimates = [info["pose"]]
-        total = 0.0
-        covariances: list[Array] = []
-        for reward, _, info in steps:
-            paths.append(info.get("true_pose", info["pose"]))
-            estimates.append(info["pose"])
-            covariance = info.get("covariance")
-            if covariance is not None and np.shape(covariance) == (3, 3):
-                covariances = [*covariances[:1], covariance]
-            total += float(reward)
-        collided = "collision" if np.any(info.get("collision", False)) else "time-out"
-        believed = "success" if np.all(info.get("is_success", False)) else collided
-        driven = (
-            np.array(paths),
-            np.array(estimates),
-            goal,
-            info_at_start["bodies"],
-            total,
-        )
-        if "true_pose" in info:
-            task = getattr(env.unwrapped, "task", None)
-            result = _judge(believed, info, task, goal, touched)
-            return Episode(seed, result, *driven, believed)
-        uncertain = None
-        if covariances:
-            uncertain = compute_uncertainty_gain(covariances[0], covariances[-1])
-        return Episode(seed, believed, *driven, uncertain=uncertain)
+        _, _, start = next(steps)
+        track = _Track([start["start"]], [start["pose"]])
+        end = start
+        for reward, _, end in steps:
+            track.add(reward, end)
+        return _make_episode(env, seed, track, start, end, touched)
     except BaseException:
         # The env does not see errors raised by the policy.
         if isinstance(env.unwrapped, BridgeEnv):
             with delay_interrupts():
                 env.unwrapped.halt()
         raise
+
+
+@dataclass
+class _Track:
+    """What is recorded of the steps of an episode."""
+
+    path: list[Array]
+    estimate: list[Array]
+    reward: float = 0.0
+    covariances: tuple[Array, ...] = ()  # the first and the last
+
+    def add(self, reward: float, info: dict[str, Any]) -> None:
+        """Adds a step, given its `info`."""
+        self.path.append(info.get("true_pose", info["pose"]))
+        self.estimate.append(info["pose"])
+        self.reward += float(reward)
+        covariance = info.get("covariance")
+        if covariance is not None and np.shape(covariance) == (3, 3):
+            self.covariances = (*self.covariances[:1], covariance)
+
+
+def _make_episode(
+    env: Any,
+    seed: int,
+    track: _Track,
+    start: dict[str, Any],
+    end: dict[str, Any],
+    touched: Callable[[], bool] | None,
+) -> Episode:
+    """Judges an episode by `info` of its start and end."""
+    goal = start.get("goal")
+    if goal is None:  # a user's task may not expose its goal
+        goal = env.get_wrapper_attr("scene").goals[0]
+    collided = "collision" if np.any(end.get("collision", False)) else "time-out"
+    believed = "success" if np.all(end.get("is_success", False)) else collided
+    path = np.array(track.path)
+    estimate = np.array(track.estimate)
+    episode = Episode(
+        seed, believed, path, estimate, goal, start["bodies"], track.reward
+    )
+    if "true_pose" in end:
+        task = getattr(env.unwrapped, "task", None)
+        result = _judge(believed, end, task, goal, touched)
+        return replace(episode, result=result, believed=believed)
+    if not track.covariances:
+        return episode
+    first, last = track.covariances[0], track.covariances[-1]
+    return replace(episode, uncertain=compute_uncertainty_gain(first, last))
 
 
 def _judge(
@@ -252,40 +273,37 @@ def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcom
         np.resize(checked_seeds[k : k + width], width)
         for k in range(0, len(checked_seeds), width)
     )
-    done = zip(*(_drive_once(env, act, batch) for batch in batches), strict=True)
-    return Outcomes(
-        checked_seeds, *(np.concatenate(rows)[: len(checked_seeds)] for rows in done)
-    )
+    done = (vars(_drive_once(env, act, batch)).values() for batch in batches)
+    rows = zip(*done, strict=True)
+    return Outcomes(*(np.concatenate(row)[: len(checked_seeds)] for row in rows))
 
 
-def _drive_once(env: BridgeVectorEnv, act: Act, seeds: Integers) -> tuple[Any, ...]:
-    """Runs one episode in each world; returns the fields of `Outcomes` except seeds, each (N,)."""
+def _drive_once(env: BridgeVectorEnv, act: Act, seeds: Integers) -> Outcomes:
+    """Runs one episode in each world, from seeds (N,)."""
     count = env.num_envs
+    flags = np.zeros((3, count), np.bool_)
+    sums = np.zeros((2, count))
+    steps = np.zeros(count, np.int64)
+    outcomes = Outcomes(seeds, flags[0], flags[1], steps, sums[0], sums[1], flags[2])
     driven = _drive_steps(env, act, list(seeds))
     _, _, info = next(driven)
-    previous = np.reshape(info["start"], (count, -1, 3))[..., :2]
-    success, collision, believed = np.zeros((3, count), np.bool_)
-    steps = np.zeros(count, np.int64)
-    length, reward = np.zeros((2, count))
+    place = np.reshape(info["start"], (count, -1, 3))[..., :2]
     running = np.ones(count, np.bool_)
-    for gain, over, info in driven:
-        position = np.reshape(info["true_pose"], (count, -1, 3))[..., :2]
-        moved = np.hypot(*np.moveaxis(position - previous, -1, 0)).mean(axis=-1)
-        previous = position
-        length += np.where(running, moved, 0.0)
-        reward += np.where(running, gain, 0.0)
+    for reward, over, info in driven:
+        last_place = place
+        place = np.reshape(info["true_pose"], (count, -1, 3))[..., :2]
+        moved = np.hypot(*np.moveaxis(place - last_place, -1, 0)).mean(axis=-1)
+        sums[:, running] += np.stack([moved, reward])[:, running]
         steps += running
-        ended = running & over
-        arrived, truly_arrived, hit = _judge_worlds(env.task, info)
-        believed |= ended & arrived
-        success |= ended & truly_arrived & ~hit
-        collision |= ended & hit
-        running &= ~ended
-    return success, collision, steps, length, reward, believed
+        _judge_worlds(env.task, info, running & over, outcomes)
+        running &= ~over
+    return outcomes
 
 
-def _judge_worlds(task: Any, info: dict[str, Any]) -> tuple[Mask, Mask, Mask]:
-    """Returns flags (N,): believed to have arrived, truly there, and truly touched something."""
+def _judge_worlds(
+    task: Any, info: dict[str, Any], ended: Mask, outcomes: Outcomes
+) -> None:
+    """Writes the flags of the worlds (N,) that have just ended."""
     seen = np.asarray(_get_flags(info, "collision").any(axis=1))
     arrived = np.asarray(_get_flags(info, "is_success").all(axis=1)) & ~seen
     is_there = arrived
@@ -294,7 +312,9 @@ def _judge_worlds(task: Any, info: dict[str, Any]) -> tuple[Mask, Mask, Mask]:
         is_there = arrived & near.reshape(len(arrived), -1).all(axis=1)
     true = "true_collision" if "true_collision" in info else "collision"
     hit = np.asarray(_get_flags(info, true).any(axis=1))
-    return arrived, is_there, hit
+    outcomes.believed[ended & arrived] = True
+    outcomes.success[ended & is_there & ~hit] = True
+    outcomes.collision[ended & hit] = True
 
 
 def _get_flags(info: dict[str, Any], name: str) -> Mask:

@@ -6,6 +6,7 @@ obstacles, it is up to 1 + `DEARER` times as high.
 """
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import Array
-from nics_drl_bridge.lidar.arrays import Mask
+from nics_drl_bridge.lidar.arrays import AnyArray, Mask
 from nics_drl_bridge.lidar.maps import FREE, OCCUPIED, GridMap
 
 CELL = 0.1  # minimum side of a cell [m]
@@ -103,20 +104,20 @@ def _search(passable: Mask, cell_costs: Array, start: Cell, goal: Cell) -> list[
 
 def _link_cells(passable: Mask, cell_costs: Array) -> Any:
     """Returns the sparse matrix (rows * columns)^2 of the costs of all links."""
+    links = zip(*_list_links(passable, cell_costs), strict=True)
+    ends, other_ends, costs = map(np.concatenate, links)
+    shape = (passable.size, passable.size)
+    return coo_array((costs, (ends, other_ends)), shape=shape).tocsr()
+
+
+def _list_links(passable: Mask, cell_costs: Array) -> Iterator[tuple[AnyArray, ...]]:
+    """Yields cells (n,), their neighbours and the costs of the links, for each of `NEIGHBOURS`."""
     rows, columns = passable.shape
     nodes = np.arange(passable.size).reshape(passable.shape)
-    ends = []
-    other_ends = []
-    costs = []
     for down, right, length in NEIGHBOURS:
         # Two views of the grid, in which the same index is a cell and its neighbour.
         cell = np.s_[: rows - down, max(0, -right) : columns - max(0, right)]
         neighbour = np.s_[down:, max(0, right) : columns - max(0, -right)]
         linked = passable[cell] & passable[neighbour]
         link_costs = length * 0.5 * (cell_costs[cell] + cell_costs[neighbour])
-        ends.append(nodes[cell][linked])
-        other_ends.append(nodes[neighbour][linked])
-        costs.append(link_costs[linked])
-    links = (np.concatenate(ends), np.concatenate(other_ends))
-    size = passable.size
-    return coo_array((np.concatenate(costs), links), shape=(size, size)).tocsr()
+        yield nodes[cell][linked], nodes[neighbour][linked], link_costs[linked]

@@ -18,6 +18,7 @@ from nics_drl_bridge.pacing import ActionPace
 from nics_drl_bridge.policy.file.stateful import resume
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.recording.messages import read_robot_command
+from nics_drl_bridge.robot.spec import RobotSpec
 
 JITTER = 0.25  # maximum earliness of a scan, in control periods
 HELD_S = 1.0  # age at which a command no longer applies to the robot
@@ -95,6 +96,24 @@ def shadow(
                 f"--topic {role}=/car/{role}."
             )
     playback = Playback(model, POSE in messages, any_lidar=True)
+    moments = _find_moments(messages, playback, model)
+    if not moments:
+        raise RecordingError(
+            f"{path}: no scan with matching odometry; see nics bag info."
+        )
+    if goal is None:
+        goals = _find_later_places(moments, ahead_s)
+    else:
+        goals = np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
+    return _compare_moments(
+        moments, goals, policy, replace(model, lidar=playback.lidar)
+    )
+
+
+def _find_moments(
+    messages: Mapping[str, Any], playback: Playback, model: SimulatorModel
+) -> list[_Moment]:
+    """Plays messages by role; returns the times at which the policy would have acted."""
     pace = ActionPace(model.control_period)
     moments = list[_Moment]()
     held: tuple[int, Array] | None = None
@@ -120,17 +139,7 @@ def shadow(
         view = playback.middleware.view(playback.middleware.newest_ns or scan_ns)
         moments.append(_Moment(message.receive_ns, scan_ns, view))
     _hold(moments, held)
-    if not moments:
-        raise RecordingError(
-            f"{path}: no scan with matching odometry; see nics bag info."
-        )
-    if goal is None:
-        goals = _find_later_places(moments, ahead_s)
-    else:
-        goals = np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
-    return _compare_moments(
-        moments, goals, policy, replace(model, lidar=playback.lidar)
-    )
+    return moments
 
 
 def _find_later_places(moments: list[_Moment], ahead_s: float) -> Array:
@@ -174,11 +183,18 @@ def _compare_moments(
                 (moment.stamp_ns, moment.view.pose, goal, wanted, moment.driven)
             )
     if not rows:
-        reasons = ", ".join(
-            f"{count} times {why}" for why, count in skipped.items() if count
+        counts = [f"{skipped[why]} times {why}" for why in skipped if skipped[why]]
+        raise RecordingError(
+            f"nothing to compare: {', '.join(counts)}; choose another goal."
         )
-        raise RecordingError(f"nothing to compare: {reasons}; choose another goal.")
-    stamps, poses, aims, wanted, driven = (
+    return _make_shadow(robot, rows, skipped, resets)
+
+
+def _make_shadow(
+    robot: RobotSpec, rows: list[tuple[Any, ...]], skipped: dict[str, int], resets: int
+) -> Shadow:
+    """Returns the comparison of rows: stamp, pose, goal, command of the policy, driven command."""
+    stamps, poses, goals, wanted, driven = (
         np.array(column) for column in zip(*rows, strict=True)
     )
     return Shadow(
@@ -186,7 +202,7 @@ def _compare_moments(
         tuple(command.unit for command in robot.command),
         (stamps - stamps[0]) * S_PER_NS,
         poses,
-        aims,
+        goals,
         wanted,
         driven,
         np.maximum(np.abs(robot.command_low), np.abs(robot.command_high)),

@@ -501,18 +501,16 @@ def put_in_order(
     """
     sort_into_cells(n, bodies[:standing], standing, cells)
     first = cells.first[n]
-    end = cells.first.shape[1] - 1
-    present = first[end]
-    count = first[end]
+    count = first[-1]
     for k in range(standing):
         _copy(bodies[k], spare[k])
-    for i in range(present):
+    for i in range(count):
         _copy(spare[cells.then[0, i]], bodies[i])
     for k in range(standing):
         if spare[k, RADIUS] <= 0.0:
             _copy(spare[k], bodies[count])
             count += 1
-    first[end] = len(bodies)  # absent and moving bodies are always found
+    first[-1] = len(bodies)  # absent and moving bodies are always found
 
 
 @kernel

@@ -383,8 +383,7 @@ def _deflect(m: int, time: float, world: ContactWorld) -> None:
     """Deflect the motion of a robot so that it does not approach what it touches.
 
     Each pass removes the approach at one touch after another, by the impulse that would
-        stop a ring there: the robot slides without friction, and a touched corner turns
-        it.
+    stop a ring there: the robot slides without friction, and a touched corner turns it.
     """
     motion = world.scratch.motions[m]
     body = world.bodies[world.first + m]

@@ -154,8 +154,8 @@ def propagate(
     """Propagate the covariances (M, 3, 3) of poses by odometry (M, 3) from before to after.
 
     A heading error rotates the motion that follows: P' = F P F^T + Q, where F is the
-        Jacobian of the new pose with respect to the old one (Thrun et al.,
-        Probabilistic Robotics, Sec. 5.4), and Q is `added`.
+    Jacobian of the new pose with respect to the old one (Thrun et al., Probabilistic
+    Robotics, Sec. 5.4), and Q is `added`.
     """
     moved = np.subtract(after, before)
     derivative = np.tile(np.eye(3), (len(covariance), 1, 1))

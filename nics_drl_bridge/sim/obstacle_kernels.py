@@ -76,33 +76,17 @@ CANDIDATES = 16
 
 
 @kernel
-def _share(seed: int, counter: int) -> float:
-    return random.uniform(seed, random.MOTION_STREAM, counter)
-
-
-@kernel
 def reset_marks(n: int, data: State, plans: Records) -> None:
-    """Reset the memory of the obstacles of world n for an episode; draw their speeds."""
-    seed = data.seeds[n]
-    bodies = data.bodies
+    """Begin the memory of the moving obstacles of world n, which is 0; draw their speeds."""
     for k in range(len(plans)):
         mark = data.marks[n, k]
         row = plans[k]
-        mark.vx = 0.0
-        mark.vy = 0.0
-        mark.index = 0
-        mark.rest = 0.0
-        mark.speed = 0.0
-        mark.goal_x = 0.0
-        mark.goal_y = 0.0
-        mark.until = 0.0
-        mark.way = 0
         if row.kind == STILL:
             continue
-        low = row.slowest
-        high = row.fastest
-        mark.speed = low + (high - low) * _share(seed, k * DRAWS)
-        mark.goal_x, mark.goal_y = bodies[n, k, X], bodies[n, k, Y]
+        share = random.uniform(data.seeds[n], random.MOTION_STREAM, k * DRAWS)
+        mark.speed = row.slowest + (row.fastest - row.slowest) * share
+        mark.goal_x = data.bodies[n, k, X]
+        mark.goal_y = data.bodies[n, k, Y]
         mark.until = -1.0
         mark.way = 1
 
@@ -121,21 +105,26 @@ def steer(
     keep their velocity.
     """
     velocity = data.velocity[n]
-    count = len(velocity)
     plans = scene.plans
-    bodies = data.bodies[n]
     traffic = Traffic(
-        bodies, count, speeds, plans, scene.walls, scene.bounds, scene.grid, period
+        data.bodies[n],
+        len(velocity),
+        speeds,
+        plans,
+        scene.walls,
+        scene.bounds,
+        scene.grid,
+        period,
     )
     # walkers first, because they react to the velocities of the last period
-    for k in range(count):
+    for k in range(len(velocity)):
         velocity[k, :] = 0.0
-        if plans[k].kind == PEDESTRIAN and bodies[k, RADIUS] > 0.0:
+        if plans[k].kind == PEDESTRIAN and traffic.bodies[k, RADIUS] > 0.0:
             velocity[k, 0], velocity[k, 1] = _walk(k, n, traffic, data)
-    for k in range(count):
+    for k in range(len(velocity)):
         kind = plans[k].kind
         mark = data.marks[n, k]
-        body = bodies[k]
+        body = traffic.bodies[k]
         if kind == STILL or body[RADIUS] <= 0.0:
             continue
         dx = velocity[k, 0] * period
@@ -149,7 +138,8 @@ def steer(
             _follow(mark, body, plans[k], scene.waypoints, period, True)
         mark.vx = dx / period
         mark.vy = dy / period
-        velocity[k, 0], velocity[k, 1] = mark.vx, mark.vy
+        velocity[k, 0] = mark.vx
+        velocity[k, 1] = mark.vy
         if dx != 0.0 or dy != 0.0:  # it faces the direction of motion
             turn = wrap(math.atan2(dy, dx) - body[HEADING]) / period
             velocity[k, 2] = min(max(turn, -TURN), TURN)
@@ -285,29 +275,24 @@ def _from_bodies(
 def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
     body = traffic.bodies[k]
     row = traffic.plans[k]
-    walls = traffic.walls
     ax = 0.0
     ay = 0.0
-    x = body[X]
-    y = body[Y]
-    radius = body[RADIUS]
-    reach = row.wall_range
-    far = radius + FAR * reach
-    for w in range(len(walls)):
-        ox, oy, away2 = find_wall(x, y, walls[w])
+    far = body[RADIUS] + FAR * row.wall_range
+    for wall in traffic.walls:
+        dx, dy, away2 = find_wall(body[X], body[Y], wall)
         if 0.0 < away2 < far * far:
             away = math.sqrt(away2)
-            size = (
-                row.wall_repulsion / reach * math.exp(-max(away - radius, 0.0) / reach)
-            )
-            ax -= size * ox / away
-            ay -= size * oy / away
-    away = map_distance(x, y, traffic.grid)
+            gap = max(away - body[RADIUS], 0.0)
+            size = row.wall_repulsion / row.wall_range * math.exp(-gap / row.wall_range)
+            ax -= size * dx / away
+            ay -= size * dy / away
+    away = map_distance(body[X], body[Y], traffic.grid)
     if away < far:
-        nx, ny = map_direction(x, y, traffic.grid)
-        size = row.wall_repulsion / reach * math.exp(-max(away - radius, 0.0) / reach)
-        ax -= size * nx
-        ay -= size * ny
+        dx, dy = map_direction(body[X], body[Y], traffic.grid)
+        gap = max(away - body[RADIUS], 0.0)
+        size = row.wall_repulsion / row.wall_range * math.exp(-gap / row.wall_range)
+        ax -= size * dx
+        ay -= size * dy
     return ax, ay
 
 
@@ -323,10 +308,10 @@ def _choose_goal(
     deep = max((field[3] - field[1]) / 2.0 - body[RADIUS] - ROOM, 0.0)
     away = 0.0
     for i in range(CANDIDATES):
-        right = 2.0 * _share(seed, counter + 2 * i) - 1.0
-        up = 2.0 * _share(seed, counter + 2 * i + 1) - 1.0
-        mark.goal_x = (field[0] + field[2]) / 2.0 + right * wide
-        mark.goal_y = (field[1] + field[3]) / 2.0 + up * deep
+        right = random.uniform(seed, random.MOTION_STREAM, counter + 2 * i)
+        up = random.uniform(seed, random.MOTION_STREAM, counter + 2 * i + 1)
+        mark.goal_x = (field[0] + field[2]) / 2.0 + (2.0 * right - 1.0) * wide
+        mark.goal_y = (field[1] + field[3]) / 2.0 + (2.0 * up - 1.0) * deep
         away = math.hypot(mark.goal_x - body[X], mark.goal_y - body[Y])
         is_far = away >= LEAST_WALK
         if is_far and clearance(mark.goal_x, mark.goal_y, k, traffic) >= room:
@@ -504,19 +489,15 @@ def _hold_walls(
     traffic: Traffic,
     bend: bool,
 ) -> tuple[float, float]:
-    x = body[X]
-    y = body[Y]
     radius = body[RADIUS]
-    walls = traffic.walls
-    field = traffic.field
     reach = radius + math.sqrt(dx * dx + dy * dy) + 2.0 * SLACK
     for side, bound in ((-1.0, 0), (1.0, 2)):
-        dx, dy = _hold(dx, dy, side, 0.0, side * field[bound] - radius - side * x, bend)
-        dx, dy = _hold(
-            dx, dy, 0.0, side, side * field[bound + 1] - radius - side * y, bend
-        )
-    for w in range(len(walls)):
-        ox, oy, away2 = find_wall(x, y, walls[w])
+        room = side * traffic.field[bound] - radius - side * body[X]
+        dx, dy = _hold(dx, dy, side, 0.0, room, bend)
+        room = side * traffic.field[bound + 1] - radius - side * body[Y]
+        dx, dy = _hold(dx, dy, 0.0, side, room, bend)
+    for wall in traffic.walls:
+        ox, oy, away2 = find_wall(body[X], body[Y], wall)
         if 0.0 < away2 < reach * reach:
             away = math.sqrt(away2)
             dx, dy = _hold(dx, dy, ox / away, oy / away, away - radius, bend)
@@ -546,23 +527,36 @@ def _hold_map(
         if map_distance(x + dx, y + dy, grid) - radius >= clearance:
             return dx, dy
         return 0.0, 0.0
+    free = _find_free_part(dx, dy, length, body, grid)
+    return dx * free, dy * free
+
+
+@kernel
+def _find_free_part(
+    dx: float, dy: float, length: float, body: Array, grid: MapField
+) -> float:
+    """Return the part of a displacement, from 0 to 1, before a body touches the map."""
     free = 0.0
     way = 0.0
-    room = clearance
+    room = map_distance(body[X], body[Y], grid) - body[RADIUS]
     finest = FINEST * grid.cell / length
     while way < 1.0:
         way = min(way + max(room / length, finest), 1.0)
-        room = map_distance(x + dx * way, y + dy * way, grid) - radius
+        x = body[X] + dx * way
+        y = body[Y] + dy * way
+        room = map_distance(x, y, grid) - body[RADIUS]
         if room < SLACK:
             break
         free = way
     for _ in range(HALVINGS if free < way else 0):
         middle = 0.5 * (free + way)
-        if map_distance(x + dx * middle, y + dy * middle, grid) - radius < SLACK:
+        x = body[X] + dx * middle
+        y = body[Y] + dy * middle
+        if map_distance(x, y, grid) - body[RADIUS] < SLACK:
             way = middle
         else:
             free = middle
-    return dx * free, dy * free
+    return free
 
 
 @kernel

@@ -404,17 +404,15 @@ def _choose_obstacles(
 def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> bool:
     """Place the obstacles of the scene; return True if there was space for all of them."""
     space = plan.space
-    outlines = plan.outlines
-    gaps = scratch.gaps
+    first = plan.outlines.first
     trial = scratch.trial
     for k in range(len(bodies)):
         group = plan.groups[plan.group[k]]
-        gaps[k] = max(group.gap, MARGIN)
+        scratch.gaps[k] = max(group.gap, MARGIN)
         bodies[k, RADIUS] = 0.0
         if group.is_fixed:
             pose = plan.poses[k]
-            shape = int(bodies[k, SHAPE])
-            _put(bodies[k], pose[0], pose[1], pose[2], shape, plan)
+            _put(bodies[k], pose[0], pose[1], pose[2], int(bodies[k, SHAPE]), plan)
     for k in range(len(bodies)):
         if plan.groups[plan.group[k]].is_fixed or not scratch.active[k]:
             continue
@@ -423,7 +421,7 @@ def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> b
         placed = False
         for _ in range(TRIES):
             x, y = _draw_point(space.for_anything, space.cells, scratch)
-            if outlines.first[shape] < outlines.first[shape + 1]:
+            if first[shape] < first[shape + 1]:
                 heading = (2.0 * _draw(scratch) - 1.0) * math.pi
             _put(trial, x, y, heading, shape, plan)
             placed = _is_apart(k, plan, bodies, scratch) and _clear_of_walls(
@@ -440,12 +438,10 @@ def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> b
 @kernel
 def _is_apart(k: int, plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> bool:
     """True if the trial of obstacle k keeps its gap from those that are placed."""
-    trial = scratch.trial
-    gaps = scratch.gaps
     for j in range(len(bodies)):
-        gap = max(gaps[k], gaps[j])
+        gap = max(scratch.gaps[k], scratch.gaps[j])
         if bodies[j, RADIUS] > 0.0 and not _clear_of(
-            trial, bodies[j], gap, plan.outlines, scratch.listed
+            scratch.trial, bodies[j], gap, plan.outlines, scratch.listed
         ):
             return False
     return True
@@ -471,7 +467,25 @@ def _draw_place(
 
 
 @kernel
-def _apart(x: float, y: float, others: Array, m: int, least: float) -> bool:
+def _draw_goal(
+    x: float, y: float, plan: ScenePlan, scratch: SceneScratch
+) -> tuple[float, float]:
+    """Draw a goal for a start at x, y: in one of the places, or in the ring around it."""
+    if not plan.around:
+        gx, gy, _ = _draw_place(plan.goals, plan.space, scratch)
+        return gx, gy
+    turn = 2.0 * math.pi * _draw(scratch)
+    inner = plan.least * plan.least
+    ring = plan.greatest * plan.greatest - inner
+    far = math.sqrt(inner + _draw(scratch) * ring)
+    scratch.draws[0].counter += 2  # as many draws as a place takes
+    return x + far * math.cos(turn), y + far * math.sin(turn)
+
+
+@kernel
+def _is_spaced(x: float, y: float, others: Array, m: int, plan: ScenePlan) -> bool:
+    """True if robots fit at x, y and at the first m of others."""
+    least = 2.0 * plan.footprint + plan.clearance
     for k in range(m):
         dx = x - others[k, 0]
         dy = y - others[k, 1]
@@ -489,7 +503,6 @@ def _place_robots(
     scratch: SceneScratch,
 ) -> bool:
     """Draw a start and a goal for each robot; return True if all were found."""
-    between = 2.0 * plan.footprint + plan.clearance
     for m in range(len(starts)):
         placed = False
         detours = 0
@@ -498,21 +511,12 @@ def _place_robots(
             area = area_of(x, y, plan.space)
             if area == 0 or not _is_free(x, y, plan, bodies, scratch):
                 continue
-            if plan.around:  # uniformly in the ring around the start
-                turn = 2.0 * math.pi * _draw(scratch)
-                inner = plan.least * plan.least
-                ring = plan.greatest * plan.greatest - inner
-                far = math.sqrt(inner + _draw(scratch) * ring)
-                scratch.draws[0].counter += 2  # as many draws as a place takes
-                gx = x + far * math.cos(turn)
-                gy = y + far * math.sin(turn)
-            else:
-                gx, gy, _ = _draw_place(plan.goals, plan.space, scratch)
+            gx, gy = _draw_goal(x, y, plan, scratch)
             distance2 = (gx - x) * (gx - x) + (gy - y) * (gy - y)
             fits = plan.least * plan.least <= distance2 <= plan.greatest * plan.greatest
             fits = fits and area_of(gx, gy, plan.space) == area
-            fits = fits and _apart(x, y, starts, m, between)
-            fits = fits and _apart(gx, gy, goals, m, between)
+            fits = fits and _is_spaced(x, y, starts, m, plan)
+            fits = fits and _is_spaced(gx, gy, goals, m, plan)
             if not (fits and _is_free(gx, gy, plan, bodies, scratch)):
                 continue
             if not _is_joined(x, y, gx, gy, plan, bodies, scratch):

@@ -472,12 +472,16 @@ def _judge(
 ) -> Iterator[tuple[str, list[float], bool]]:
     """Yield the key and value of each region or pose, and whether a robot fits there."""
     x, y = _centres(cells)[:, area > 0]
-    for number, region in enumerate(places.regions):
-        x1, x2 = sorted(region[::2])
-        y1, y2 = sorted(region[1::2])
-        within = (x >= x1) & (x <= x2) & (y >= y1) & (y <= y2)
-        yield f"regions.{number}", list(region), bool(within.any())
+    for number, (x1, y1, x2, y2) in enumerate(places.regions):
+        fits = _is_between(x, x1, x2) & _is_between(y, y1, y2)
+        yield f"regions.{number}", [x1, y1, x2, y2], bool(fits.any())
     for number, at in enumerate(places.at):
         i, j, _ = kernels.cell_of(at[0], at[1], cells)
         inside = 0 <= i < area.shape[0] and 0 <= j < area.shape[1]
         yield f"at.{number}", list(at), inside and bool(area[i, j])
+
+
+def _is_between(values: Array, end: float, other_end: float) -> Mask:
+    low = min(end, other_end)
+    high = max(end, other_end)
+    return np.asarray((values >= low) & (values <= high))

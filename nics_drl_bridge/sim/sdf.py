@@ -158,7 +158,6 @@ class Standing(NamedTuple):
 
     placed: tuple[Placed, ...]
     left_out: tuple[str, ...]  # a clause for each model that a world can't contain
-    missing: bool = False  # the file of one of these models is missing
 
     @property
     def obstacles(self) -> tuple[Obstacles, ...]:
@@ -450,7 +449,6 @@ def read_sdf(
     height: float,
     without: tuple[str, ...] = (),
     skip_unknown: bool = False,
-    may_be_empty: bool = False,
 ) -> Standing:
     """Read the obstacles of a Gazebo world at a height [m] above z = 0.
 
@@ -460,7 +458,6 @@ def read_sdf(
         without: names of models to leave out; `*` matches anything.
         skip_unknown: True to leave out bodies that have no supported shape: meshes and
             tilted bodies.
-        may_be_empty: True to accept a world without obstacles.
 
     Raises:
         ConfigError: the file is damaged or not SDF, has an unsupported shape, or has no
@@ -496,16 +493,16 @@ def read_sdf(
         f"model {name!r} has {', '.join(what)}" for name, what in unknown.items()
     )
     shapes = seen - sum(map(len, unknown.values()))
-    if left_out and not (skip_unknown and (shapes or may_be_empty)):
+    if left_out and not (skip_unknown and shapes):
         raise AssetsError(
             path,
             f": {_explain_left_out(left_out, skip_unknown)}",
             next(iter(unknown)) in missing,
         )
-    if not placed and not may_be_empty:
+    if not placed:
         reason = f"none of its {shapes} collision geometries is at height {height:g} m"
         raise SdfError(path, f": {reason}; choose another --height.")
-    return Standing(tuple(placed), left_out, bool(missing))
+    return Standing(tuple(placed), left_out)
 
 
 def _explain_left_out(left_out: tuple[str, ...], skip_unknown: bool) -> str:

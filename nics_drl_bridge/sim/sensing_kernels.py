@@ -285,9 +285,9 @@ def _gather_bodies(n: int, m: int, lag: int, reach: float, part: Part) -> int:
     """Copy the bodies around `scans.pose` of `lag` substeps ago; return their number.
 
     Robots are interpolated from their recorded past. The past of obstacles is not
-        recorded: they are moved back by their current velocity. This is exact within
-        the period, and before it for as long as the velocity was constant. The
-        extrapolation is limited to `FURTHEST_BACK`.
+    recorded: they are moved back by their current velocity. This is exact within the
+    period, and before it for as long as the velocity was constant. The extrapolation is
+    limited to `FURTHEST_BACK`.
     """
     data = part.data
     world_set = part.world_set

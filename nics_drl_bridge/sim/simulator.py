@@ -175,11 +175,9 @@ ROBOT_ARRAYS = (
     "noise",
     "past",
 )
-REBUILT = (
-    "_world_set",
-    "packed",
-    "_renders",
-)  # each copy of a simulator rebuilds these
+# Arrays of the state that a reset sets to 0.
+CLEARED = ("state", "history", "twist", "collided", "steps", "velocity", "marks")
+REBUILT = ("_world_set", "packed", "_renders")  # by each copy of a simulator
 
 
 class FastSimulator:
@@ -314,7 +312,7 @@ class FastSimulator:
         data = self.data
         data.pose[chosen] = poses
         data.odom[chosen] = poses
-        for name in ("state", "history", "twist", "collided", "steps", "velocity"):
+        for name in CLEARED:
             getattr(data, name)[chosen] = 0
         data.seeds[chosen] = np.asarray(seeds, np.int64)
         data.member[chosen] = scenes.member
@@ -507,25 +505,23 @@ class FastSimulator:
     def _world_set(self) -> WorldSetArrays:
         """Stacked surroundings of the members of the world set."""
         members = self.world.members
-        motions = self.sampler.motions
-        crowded = self._sizes.crowded
         grids = _share_equal_maps([world.grid for world in members])
         distances, places = joined([map_field(grid).distances for grid in grids])
-        moves = any(motion is not None for group in motions for motion in group)
-        standing = not (crowded or moves) and self.sampler.count >= STANDING
-        plans, waypoints = _stack_plans(motions if moves else [() for _ in members])
+        plans, waypoints = _stack_plans(self.sampler.motions)
+        moves = plans.size > 0
+        crowded = self._sizes.crowded
         walls = [world.all_walls() for world in members]
         return WorldSetArrays(
-            stack_fixtures(walls, grids, self.data.member),
-            distances,
-            places,
-            self._scanner.table.outlines.arguments,
-            crowded,
-            standing,
-            moves,
-            plans,
-            waypoints,
-            np.array([world.extent for world in members]),
+            fixtures=stack_fixtures(walls, grids, self.data.member),
+            distances=distances,
+            map_places=places,
+            outlines=self._scanner.table.outlines.arguments,
+            crowded=crowded,
+            standing=not (crowded or moves) and self.sampler.count >= STANDING,
+            moves=moves,
+            plans=plans,
+            waypoints=waypoints,
+            bounds=np.array([world.extent for world in members]),
         )
 
     @cached_property
@@ -705,9 +701,14 @@ def map_field(grid: GridMap | None) -> records.MapField:
 def _stack_plans(
     motions: Sequence[Sequence[Motion | None]],
 ) -> tuple[records.Records, Array]:
-    """Return the plans (P, K) and waypoints (Q, 2) of the motions (P, K) of all members."""
-    plans = np.zeros((len(motions), max(map(len, motions))), records.PLAN)
+    """Return the plans (P, K) and waypoints (Q, 2) of the motions (P, K) of all members.
+
+    If nothing moves, there are no plans (P, 0).
+    """
     waypoints = np.zeros((0, 2))
+    if all(motion is None for group in motions for motion in group):
+        return np.zeros((len(motions), 0), records.PLAN), waypoints
+    plans = np.zeros((len(motions), max(map(len, motions))), records.PLAN)
     for plan, motions_of_member in zip(plans, motions, strict=True):
         plan[: len(motions_of_member)], more = plan_arrays(motions_of_member)
         plan["first"] += len(waypoints)

@@ -112,7 +112,7 @@ class State(NamedTuple):
     """Everything that changes in a simulation; `FastSimulator.data`.
 
     A reset keeps the properties of each robot: faults, coefficient, delay, age and
-        noise.
+    noise.
     """
 
     pose: Array  # (N, M, 3) true pose of `base_link` in `map`

@@ -515,7 +515,7 @@ def move_freely(
     """Move the robots of worlds [first_world, end_world), ignoring contacts.
 
     The result is in the lanes: robot m of world n is in lane (n - first_world) M + m.
-        The period is integrated piecewise between changes of the commands.
+    The period is integrated piecewise between changes of the commands.
     """
     robots = data.pose.shape[1]
     substeps = motion.substeps

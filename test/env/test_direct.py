@@ -1,5 +1,7 @@
 """Direct steps: the same as those through the task's and the backend's own methods."""
 
+from functools import cache
+
 import gymnasium
 import numpy as np
 import pytest
@@ -33,9 +35,15 @@ SAID = {
 NUMBERS = {"an int": 2, "an int64": np.int64(2), "an array": np.array(2)}
 
 
-def take_step(task, actions, action):
+@cache
+def env_of(task, actions):
     env = BridgeEnv("sim", direct_model(), field(), task, {"actions": actions})
     assert env._direct is not None
+    return env
+
+
+def take_step(task, actions, action):
+    env = env_of(task, actions)
     env.reset(seed=0)
     return env.step(action)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+from functools import partial
 from types import SimpleNamespace
 
 import gymnasium
@@ -278,13 +279,8 @@ def test_a_policy_or_callback_that_raises_amid_an_episode_stops_the_robot(
     FAULT.now = Fault(when, error)
     with pytest.raises(error):  # noqa: PT012
         for seed in range(20):
-            drive(
-                env,
-                SimpleNamespace(act=act),
-                seed,
-                None,
-                lambda: FAULT.now.at("on_start"),
-            )
+            begin = partial(FAULT.now.at, "on_start")
+            drive(env, SimpleNamespace(act=act), seed, None, begin)
     assert not robot.last.any()
 
 

@@ -17,14 +17,9 @@ def task():
 
 
 def view(pose=(0.0, 0.0, 0.0), twist=(0.0, 0.0, 0.0), ranges=None):
-    ranges = (
-        np.full(B, np.inf, np.float32)
-        if ranges is None
-        else np.asarray(ranges, np.float32)
-    )
-    return RobotView(
-        np.array(pose, float), np.array(twist, float), ranges, 0.0, 0.0, 0.0
-    )
+    scan = np.full(B, np.inf) if ranges is None else np.asarray(ranges)
+    motion = np.array(pose, float), np.array(twist, float)
+    return RobotView(*motion, scan.astype(np.float32), 0.0, 0.0, 0.0)
 
 
 def observe(task, view, goal):
@@ -84,11 +79,8 @@ def test_a_touch_is_judged_from_the_footprint_wherever_the_lidar_sits(mount):
     for distance, touched in ((limit - 1e-3, True), (limit + 1e-3, False)):
         for angle in np.linspace(-np.pi, np.pi, 12, endpoint=False):
             # The return of one beam that ends at this distance from the robot's middle.
-            beam = int(
-                np.argmin(
-                    np.abs(np.exp(1j * (sensor.angles + mount[2])) - np.exp(1j * angle))
-                )
-            )
+            away = np.exp(1j * (sensor.angles + mount[2])) - np.exp(1j * angle)
+            beam = int(np.argmin(np.abs(away)))
             direction = sensor.angles[beam] + mount[2]
             along = mount[0] * np.cos(direction) + mount[1] * np.sin(direction)
             rest = mount[0] ** 2 + mount[1] ** 2 - distance**2

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from functools import cache, partial
+
 import numpy as np
 import pytest
 from robots import direct_model, field
@@ -10,20 +12,16 @@ from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 
-
-def single():
-    return BridgeEnv(model=direct_model(), world=field())
-
-
-def vector(count=3):
-    return BridgeVectorEnv(count, model=direct_model(), world=field())
+ENVS = {
+    "single": BridgeEnv,
+    "vector": partial(BridgeVectorEnv, 3),
+    "agents": BridgeParallelEnv,
+}
 
 
-def agents():
-    return BridgeParallelEnv(model=direct_model(), world=field())
-
-
-ENVS = {"single": single, "vector": vector, "agents": agents}
+@cache
+def made(kind, number=0):
+    return ENVS[kind](model=direct_model(), world=field())
 
 
 @pytest.mark.parametrize("kind", sorted(ENVS))
@@ -48,35 +46,35 @@ ENVS = {"single": single, "vector": vector, "agents": agents}
 def test_what_a_reset_cant_use_is_one_sentence_and_the_next_reset_works(
     kind, arguments, sentence
 ):
-    env = ENVS[kind]()
+    env = made(kind)
     with pytest.raises(ConfigError, match=sentence.replace("?", r"\?")):
         env.reset(**arguments)
     first = env.reset(seed=3)[0]
-    again = ENVS[kind]().reset(seed=3)[0]
+    again = made(kind, number=1).reset(seed=3)[0]
     np.testing.assert_equal(first, again)
 
 
 def test_the_greatest_seed_works():
-    assert single().reset(seed=2**63 - 1)[0].dtype == np.float32
-    assert vector(3).reset(seed=2**63 - 3)[0].shape[0] == 3
+    assert made("single").reset(seed=2**63 - 1)[0].dtype == np.float32
+    assert made("vector").reset(seed=2**63 - 3)[0].shape[0] == 3
 
 
 def test_the_last_world_counts_on_from_the_seed_of_the_first():
     with pytest.raises(
         ConfigError, match=f"must be a whole number from 0 to {2**63 - 3}"
     ):
-        vector(3).reset(seed=2**63 - 2)
+        made("vector").reset(seed=2**63 - 2)
 
 
 @pytest.mark.parametrize("bad", [2**63, "x", 1.5])
 def test_a_list_of_seeds_is_checked_one_by_one(bad):
     with pytest.raises(ConfigError, match=r"^seed "):
-        vector(3).reset(seed=[1, bad, None])
+        made("vector").reset(seed=[1, bad, None])
 
 
 def test_reset_mask_is_an_option_of_the_vector_env_alone():
     with pytest.raises(ConfigError, match="unknown reset option 'reset_mask'"):
-        single().reset(options={"reset_mask": np.array([True])})
+        made("single").reset(options={"reset_mask": np.array([True])})
 
 
 @pytest.mark.parametrize(
@@ -96,7 +94,7 @@ def test_an_option_of_another_shape_is_refused_rather_than_spread(goal):
     with pytest.raises(
         ConfigError, match=r"reset option 'goal'.*must be numbers of shape"
     ):
-        single().reset(options={"goal": goal})
+        made("single").reset(options={"goal": goal})
 
 
 @pytest.mark.parametrize(

@@ -39,14 +39,6 @@ TASKS = (
     {"task": "navigation", "task_options": {"scan": 24}},
     {"task": "cooperative_reaching", "task_options": {"scan": "around"}},
 )
-IDS = (
-    "navigation",
-    "navigation-discrete",
-    "cooperative",
-    "pursuit-discrete",
-    "navigation-sectors",
-    "cooperative-sectors",
-)
 LIMIT = 25
 
 
@@ -93,8 +85,10 @@ def assert_alike(ours, theirs, path="info"):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("task", TASKS, ids=IDS)
+@pytest.mark.parametrize(
+    ("task", "mode"),
+    [*((task, MODES[0]) for task in TASKS), (TASKS[0], MODES[1]), (TASKS[3], MODES[1])],
+)
 def test_it_steps_as_gymnasiums_own_vector_env_of_single_envs(task, mode):
     ours = vector(3, threads=2, autoreset_mode=mode, **task)
     theirs = SyncVectorEnv([lambda: single(**task)] * 3, autoreset_mode=mode)
@@ -105,7 +99,7 @@ def test_it_steps_as_gymnasiums_own_vector_env_of_single_envs(task, mode):
     assert np.array_equal(mine, other)
     assert_alike(facts, known)
     ended = 0
-    for action in actions_of(ours, 120):
+    for action in actions_of(ours, 80):
         one = ours.step(action)
         another = theirs.step(action)
         for a, b in zip(one[:4], another[:4], strict=True):
@@ -116,12 +110,12 @@ def test_it_steps_as_gymnasiums_own_vector_env_of_single_envs(task, mode):
     assert ended >= 9
 
 
-@pytest.mark.parametrize("task", TASKS, ids=IDS)
+@pytest.mark.parametrize("task", TASKS[1:5])
 def test_a_world_does_not_depend_on_how_many_others_there_are(task):
     def course(count):
         env = vector(count, **task)
         seen = [env.reset(seed=10)[0][:1]]
-        for action in actions_of(vector(1, **task), 100):
+        for action in actions_of(vector(1, **task), 60):
             step = env.step(np.repeat(action, count, axis=0))
             seen += [part[:1].copy() for part in step[:4]]
         return digest(seen)
@@ -142,7 +136,7 @@ def test_threads_change_no_bit_of_what_is_taught():
         env.teach(Teaching(path=1.0, contact=-1.0, retries=1))
     one, other = (env.reset(seed=6) for env in envs)
     assert np.array_equal(one[0], other[0])
-    for action in actions_of(envs[0], 60):
+    for action in actions_of(envs[0], 30):
         one, other = (env.step(action) for env in envs)
         for a, b in zip(one[:4], other[:4], strict=True):
             assert np.array_equal(a, b)
@@ -209,11 +203,10 @@ def test_gymnasiums_checks_of_an_env_find_nothing_to_warn_of_in_a_vector(
 
 
 def test_gymnasiums_wrappers_take_it():
-    env = gymnasium.make_vec(NAVIGATION, 2, model=model(), world=field(count=2))
-    env = gymnasium.wrappers.vector.RecordEpisodeStatistics(env)
+    env = gymnasium.wrappers.vector.RecordEpisodeStatistics(vector(2))
     env.reset(seed=0)
     lengths = []
-    for action in actions_of(env, 400):
+    for action in actions_of(env, LIMIT + 1):
         info = env.step(action)[4]
         if "episode" in info:
             lengths += info["episode"]["l"][info["_episode"]].tolist()

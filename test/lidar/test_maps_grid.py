@@ -46,9 +46,6 @@ def test_what_is_unknown_stops_beams_when_asked():
     assert grid(picture, unknown_stops=True).blocked.tolist() == [
         [False, True, True, True]
     ]
-    assert grid(picture, occupied_from=50).blocked.tolist() == [
-        [False, False, True, True]
-    ]
     assert grid(picture).free.tolist() == [[True, False, False, False]]
 
 

@@ -62,7 +62,7 @@ def rmse(spec, one, other):
 def test_exact_scans_of_random_scenes_agree_with_plane_geometry(name):
     spec = SENSORS[name]
     compared = 0
-    for seed in range(24):
+    for seed in range(0, 24, 2):
         if seed % 12 == 0:
             shapes = random_shapes(seed)
             scanner = make_scanner(spec, shapes, "exact")
@@ -77,7 +77,7 @@ def test_exact_scans_of_random_scenes_agree_with_plane_geometry(name):
 @pytest.mark.slow
 def test_a_lidar_inside_or_beside_any_shape_sees_what_plane_geometry_says():
     spec = lidar(beams=90, range_min=0.0)
-    for seed in range(36):
+    for seed in range(24):
         rng = np.random.default_rng(seed)
         shape = (*random_shapes(seed), ring(rng, 40))[seed % 12]
         scanner = Scanner(spec, bake(spec, [shape], COARSE), "baked")
@@ -171,10 +171,9 @@ def test_a_closed_room_returns_on_every_beam():
     scanner = make_scanner(lidar(beams=500), [room], "exact")
     sides = [[-1, -1, 1, -1], [1, -1, 1, 1], [1, 1, -1, 1], [-1, 1, -1, -1]]
     for pose in np.random.default_rng(2).uniform(-0.9, 0.9, (20, 3)):
+        around = scanner.place([room], [0.6 * pose])
         assert np.isfinite(scanner.scan(pose, [], sides)).all()
-        assert np.isfinite(
-            scanner.scan(HERE, scanner.place([room], [0.6 * pose]))
-        ).all()
+        assert np.isfinite(scanner.scan(HERE, around)).all()
 
 
 def test_a_scan_in_a_batch_is_the_scan_alone_to_the_bit():
@@ -348,8 +347,13 @@ def test_what_does_not_belong_together_is_refused(call, keys, error, match):
 
 def test_the_table_of_another_lidar_serves_where_nothing_is_looked_up_beyond_it():
     table = bake(lidar(), (SQUARE,), COARSE)
-    Scanner(lidar(beams=73), table, "exact")
-    Scanner(lidar(range_max=2.0, range_min=0.3, mount=(0.1, 0.0, 1.0)), table)
+    nearer = lidar(range_max=2.0, range_min=0.3, mount=(0.1, 0.0, 1.0))
+    for scanner in (
+        Scanner(lidar(beams=73), table, "exact"),
+        Scanner(nearer, table, "baked"),
+    ):
+        hits = np.isfinite(scanner.scan(HERE, scanner.place([SQUARE], HERE + 1.0)))
+        assert 0 < hits.sum() < 20
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)

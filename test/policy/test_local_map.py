@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tracemalloc
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -33,12 +34,16 @@ GOAL = np.array([3.0, 0.0])
 ROBOTS = ("differential", "tricycle")
 
 
+@cache
+def outline_of(robot):
+    return fill_outline(load_robot(robot))
+
+
 def map_rays(shares, directions, origin, robot="jackal", goal=GOAL):
     """The map of a scan with these rays, as fractions of 10 m."""
     sight = Sight(np.arctan2(*np.transpose(directions)[::-1]), np.array(origin), 10.0)
     task = SimpleNamespace(sight=sight, scan_parts=len(shares))
-    outline = fill_outline(load_robot(robot))
-    around = make_situation(task, outline, CLOSE, 3.0)
+    around = make_situation(task, outline_of(robot), CLOSE, 3.0)
     map_scan(shares, goal, around)
     return around
 
@@ -61,9 +66,8 @@ def wall(x, low, high):
 
 
 def test_depths_are_distances_to_the_border_and_negative_outside():
-    shape = np.array(
-        [[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 0.4], [0.0, 1.0]]
-    )  # not convex
+    # not convex
+    shape = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 0.4], [0.0, 1.0]])
     points = np.random.default_rng(0).uniform(-1.0, 3.0, (300, 2))
     exact = Polygon(shape).exterior
     inside = prep(Polygon(shape))

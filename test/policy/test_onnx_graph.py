@@ -23,6 +23,8 @@ from policy.policy_rig import (
     with_contract,
 )
 
+pytestmark = pytest.mark.usefixtures("opened_here")
+
 make_node = onnx.helper.make_node
 from_array = onnx.numpy_helper.from_array
 
@@ -168,16 +170,14 @@ def test_what_fails_only_when_it_runs_is_a_policy_error(file, monkeypatch):
 
 def test_more_observations_than_fit_at_once_are_run_in_parts(file, monkeypatch):
     policy = load_policy(file)
-    rows = (
-        np.random.default_rng(0).uniform(0.0, 1.0, (10, SECTORS + 6)).astype(np.float32)
-    )
+    drawn = np.random.default_rng(0).uniform(0.0, 1.0, (10, SECTORS + 6))
+    rows = drawn.astype(np.float32)
     expected = policy.act(rows)
     monkeypatch.setattr(onnx_graph, "MOST_ROWS", 3)
     assert policy.act(rows) == pytest.approx(expected, abs=1e-6)
     assert policy.act(rows[:0]).shape == (0, 3)
 
 
-@pytest.mark.usefixtures("opened_here")
 @pytest.mark.parametrize("entry", ["format", "robot", "actions"])
 def test_megabytes_in_a_field_are_not_told(file, tmp_path, entry):
     proto = onnx.load(file)
@@ -190,7 +190,6 @@ def test_megabytes_in_a_field_are_not_told(file, tmp_path, entry):
     assert len(str(refused.value)) < 400 + len(str(path))
 
 
-@pytest.mark.usefixtures("opened_here")
 @pytest.mark.parametrize(
     "text",
     [

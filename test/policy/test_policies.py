@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -34,8 +35,10 @@ from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 ROBOTS = ("ackermann", "differential", "mecanum")
 
 
-def task_of(robot, **changes):
-    return Navigation(load_robot(robot), lidar(beams=90, **changes))
+@cache
+def policy_of(name, robot):
+    task = Navigation(load_robot(robot), lidar(beams=90, mount=(0.05, 0.0, 0.1)))
+    return make_policy(name, task)
 
 
 def observe(task, bearing, distance=2.0, ranges=None):
@@ -52,15 +55,17 @@ def twist_of(task, action):
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("name", sorted(POLICIES))
 def test_any_observation_gives_an_action_of_the_space_alone_as_among_many(robot, name):
-    task = task_of(robot, mount=(0.05, 0.0, 0.1))
-    alone = make_policy(name, task)
-    among = make_policy(name, task)
+    policy = policy_of(name, robot)
+    if name == "random":
+        policy = replace(policy)  # each begins with the same draws
+    task = policy.task
     rng = np.random.default_rng(0)
     seen = []
     for _ in range(8):
         ranges = rng.choice([np.inf, -np.inf, np.nan, 0.3, 1.0], 90).astype(np.float32)
         seen.append(observe(task, rng.uniform(-3, 3), rng.uniform(0, 5), ranges))
-    actions = among.act(np.array(seen))
+    actions = policy.act(np.array(seen))
+    alone = replace(policy) if name == "random" else policy
     for observation, action in zip(seen, actions, strict=True):
         mine = alone.act(observation)
         assert task.action_space.contains(mine)
@@ -70,16 +75,15 @@ def test_any_observation_gives_an_action_of_the_space_alone_as_among_many(robot,
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("name", ["dynamic_window", "mppi", "straight"])
 def test_it_turns_or_moves_to_the_side_of_the_goal_and_drives_to_one_ahead(robot, name):
-    task = task_of(robot)
-    policy = make_policy(name, task)
+    policy = policy_of(name, robot)
+    task = policy.task
     for side in (1.0, -1.0):
         _, left, turn = twist_of(task, policy.act(observe(task, side)))
         assert side * (left + turn) > 0.05
     forward, left, turn = twist_of(task, policy.act(observe(task, 0.0)))
     assert forward > 0.3
-    if name == "straight" or (
-        robot != "mecanum" and name != "mppi"
-    ):  # one on rollers is fastest askew
+    # One on rollers is fastest askew.
+    if name == "straight" or (robot != "mecanum" and name != "mppi"):
         assert (left, turn) == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
@@ -101,9 +105,8 @@ def test_the_planner_leaves_its_start_with_wheels_that_answer_slowly(tmp_path):
     robot = (share_folder() / "config" / "robots" / "differential.yaml").read_text()
     slow = tmp_path / "slow.yaml"
     slow.write_text(robot.replace("wheel_lag: 0.1", "wheel_lag: 0.8"))
-    env = BridgeEnv(
-        model=str(slow), world="empty", estimator=True
-    )  # at rest it shows no noise
+    # At rest an estimator shows no noise.
+    env = BridgeEnv(model=str(slow), world="empty", estimator=True)
     policy = make_policy("dynamic_window", env.task)
     assert successes(drive_all(TimeLimit(env, 300), policy, [0])) == 1
 
@@ -132,7 +135,7 @@ def test_the_planner_asks_a_model_whose_motors_bend_commands_where_they_lead():
     bent = replace(
         model, kinematics=replace(model.kinematics, inputs=(curve,), limits=slow)
     )
-    task = task_of("ackermann")
+    task = Navigation(model.robot, lidar())
     plain, asking = (make_policy("dynamic_window", task, m) for m in (model, bent))
     assert np.abs(asking.twists[:, 0]).max() == pytest.approx(0.7, abs=0.02)
     speeds = asking.commands[:, 0]
@@ -140,10 +143,9 @@ def test_the_planner_asks_a_model_whose_motors_bend_commands_where_they_lead():
     assert crawling < 0.3
     still = asking.twists[asking.commands[:, 0] == crawling]
     assert np.abs(still).max() < 1e-3
+    # from 0.7 m/s by 0.5 m/s^2, not by 2
     slowness = asking.ahead.slowness - plain.ahead.slowness
-    assert 0.7 * slowness == pytest.approx(
-        1.4, abs=0.35
-    )  # from 0.7 m/s by 0.5 m/s^2, not by 2
+    assert 0.7 * slowness == pytest.approx(1.4, abs=0.35)
 
 
 def test_a_car_of_unknown_wheelbase_is_refused_and_none_assumed():

@@ -52,6 +52,7 @@ def taken(step):
         step()
     grown = []
     most = []
+    gc.freeze()  # a collection then looks only at what the steps made
     tracemalloc.start()
     try:
         step()
@@ -68,6 +69,7 @@ def taken(step):
                 break
     finally:
         tracemalloc.stop()
+        gc.unfreeze()
     return min(grown), min(most)
 
 

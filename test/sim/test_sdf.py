@@ -357,11 +357,3 @@ def test_models_that_include_themselves_or_without_end_are_refused(
     monkeypatch.setattr(sdf, "MOST_MODELS", 5)
     sentence = refused(write("".join(model(DISC, f"m{i}") for i in range(6))))
     assert "holds more than 5 models" in sentence
-
-
-def test_a_world_in_which_nothing_stands_may_be_read(write):
-    for inside in ("<include><uri>model://sun</uri></include>", model(MESH, "table")):
-        standing = read_sdf(write(inside), HEIGHT, skip_unknown=True, may_be_empty=True)
-        assert standing.placed == ()
-        with pytest.raises(ConfigError):
-            read_sdf(write(inside), HEIGHT, skip_unknown=True)

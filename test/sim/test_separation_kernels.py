@@ -43,7 +43,7 @@ def traffic(bodies, kinds, speeds=NOBODY, walls=WALLS, half=HALF, grid=NO_FIELD)
 @pytest.mark.parametrize("bends", [True, False])
 def test_whatever_all_of_them_wish_nothing_touches_at_any_time_of_the_period(bends):
     solid = MultiLineString([wall.reshape(2, 2) for wall in WALLS])
-    for seed in range(100):
+    for seed in range(60):
         rng, bodies = crowd(seed)
         kinds = rng.integers(0, 3, 5)
         radii = bodies[:, 5]
@@ -57,15 +57,14 @@ def test_whatever_all_of_them_wish_nothing_touches_at_any_time_of_the_period(ben
             assert np.linalg.norm(moved[k]) <= np.linalg.norm(wishes[k]) + TOUCH
         for share in (0.3, 0.7, 1.0):
             now = bodies[:, :2] + share * moved
-            away = np.linalg.norm(now[:, None] - now, axis=-1) - (
-                radii[:, None] + radii
-            )
+            away = np.linalg.norm(now[:, None] - now, axis=-1)
+            away -= radii[:, None] + radii
             assert away[:5, :5][~np.eye(5, dtype=bool)].min() > -TOUCH
 
 
 def test_nobody_runs_into_a_robot_that_keeps_its_velocity():
     stopped = 0
-    for seed in range(300):
+    for seed in range(150):
         rng, bodies = crowd(seed, count=1, robots=1)
         towards = rng.uniform(-1.0, 1.0, 2)
         speeds = towards[None] * 0.5
@@ -77,7 +76,7 @@ def test_nobody_runs_into_a_robot_that_keeps_its_velocity():
         gap = np.linalg.norm(after) - bodies[:, 5].sum()
         assert gap > min(0.0, before - np.linalg.norm(speeds) * PERIOD) - TOUCH
         stopped += np.linalg.norm(moved) < 0.99 * np.linalg.norm(wish)
-    assert stopped > 200
+    assert stopped > 100
 
 
 def test_one_bends_along_a_wall_where_the_other_stops():
@@ -98,9 +97,7 @@ def test_nobody_jumps_through_a_thin_wall_of_a_map(bends, way):
     cells[:, 40] = 100  # 5 cm thick, from x = 0.5 m
     thin = map_field(GridMap(cells, 0.05, (-1.5, -1.5, 0.0)))
     body = place([[0.0, 0.0, 0.0]], [0.2], [0])
-    around = traffic(
-        body, [at.PEDESTRIAN], walls=WALLS[:0], half=np.full(2, 5.0), grid=thin
-    )
+    around = traffic(body, [at.PEDESTRIAN], NOBODY, WALLS[:0], np.full(2, 5.0), thin)
     for _ in range(20):
         body[0, :2] += restrain(way, 0.0, 0, around, bends)
     assert 0.28 < body[0, 0] < 0.3 + 1e-3

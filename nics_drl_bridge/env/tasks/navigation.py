@@ -205,11 +205,6 @@ class Navigation(Task):
     @cached_property
     def _rules(self) -> Any:
         """NavigationRules, packed for the kernels."""
-        rewards = (
-            self.progress_reward,
-            self.time_reward,
-            self.success_reward,
-            self.collision_reward,
-        )
-        numbers = map(float, (self.goal_radius, *rewards))
+        _, *names = NavigationRules._fields  # those of this class
+        numbers = [float(getattr(self, name)) for name in names]
         return pack(NavigationRules(self.scale, *numbers))

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from nics_drl_bridge.env.tasks.navigation import Navigation
-from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.generator import CONTROL_PERIOD_S, SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.policy.planners import local_map as maps
@@ -68,17 +68,12 @@ class DynamicWindow:
     @cached_property
     def ahead(self) -> LookAhead:
         """Parameters of the look-ahead and of braking."""
-        lags = self.task.robot.parameters.items()
-        lag = max((value for name, value in lags if name.endswith("_lag")), default=0.0)
-        if self.model is None:
-            period = 0.1
-            latency = 0.0
-            braking = Braking(lag, math.inf)
-        else:
+        period = CONTROL_PERIOD_S
+        latency = 0.0
+        if self.model is not None:
             period = self.model.control_period
             latency = max(0.0, self.model.calibration.command_latency_s)
-            limits = self.task.command_limits
-            braking = find_braking(self.task.robot, self.model.kinematics, *limits)
+        braking = self._find_braking()
         # A twist is held for a period and judged a period later; then the robot reacts. The
         # reaction time is known only to within a step of the robot's model, so it is rounded.
         held = 2.0 * period + latency
@@ -98,7 +93,7 @@ class DynamicWindow:
             seen = min(self.task.sight.range_max, maps.MOST_M)
             far = min(self._fastest * step * count, seen)
         return LookAhead(
-            self._find_reach(period, lag),
+            self._find_reach(period),
             step,
             count,
             reaction,
@@ -109,8 +104,24 @@ class DynamicWindow:
             far,
         )
 
-    def _find_reach(self, period: float, lag: float) -> Array:
+    def _find_braking(self) -> Braking:
+        """Returns how the model brakes; without one, at once after the robot's lag."""
+        if self.model is None:
+            return Braking(self._lag, math.inf)
+        limits = self.task.command_limits
+        return find_braking(self.task.robot, self.model.kinematics, *limits)
+
+    @property
+    def _lag(self) -> float:
+        """Longest lag of the robot [s]."""
+        known = self.task.robot.parameters
+        return max(
+            (known[name] for name in known if name.endswith("_lag")), default=0.0
+        )
+
+    def _find_reach(self, period: float) -> Array:
         """Returns how far each part of the twist (3,) may change within a period [s]."""
+        lag = self._lag
         fraction = 1.0 - math.exp(-period / lag) if lag > 0.0 else 1.0
         # The window includes at least one step of the grid.
         steps = [

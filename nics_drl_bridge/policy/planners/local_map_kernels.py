@@ -86,7 +86,7 @@ def find_hits(hits: Array, shares: Array, rays: ScanRays) -> int:
     """Writes end points of range fractions (P,) into hits (P, 2) [m]; returns their number.
 
     Fractions of 0 are left out: they are unknown, or too close to distinguish from the
-        robot itself.
+    robot itself.
     """
     count = 0
     for p in range(len(shares)):
@@ -109,37 +109,38 @@ def find_hits(hits: Array, shares: Array, rays: ScanRays) -> int:
 def measure_distances(seen: LocalMap, hits: Array) -> None:
     """Writes the distances of a map to hits (H, 2)."""
     grid = seen.distances
-    cell = seen.cell
-    size = len(grid)
-    half = 0.5 * size * cell
-    far = np.float32(seen.reach * seen.reach)
-    grid[:] = far
-    step = np.float32(cell)
+    half = 0.5 * len(grid) * seen.cell
+    grid[:] = np.float32(seen.reach * seen.reach)
     for h in range(len(hits)):
-        x = hits[h, 0] + half
-        y = hits[h, 1] + half
-        left, right = _find_span(x, seen.reach, cell, size)
-        low, high = _find_span(y, seen.reach, cell, size)
-        first = np.float32((left + 0.5) * cell - x)
-        for i in range(low, high):
-            dy = np.float32((i + 0.5) * cell - y)
-            row = grid[i, left:right]
-            dy2 = dy * dy
-            for j in range(len(row)):
-                dx = np.float32(j) * step + first
-                away = dx * dx + dy2
-                row[j] = away if away < row[j] else row[j]
-    for i in range(size):
+        _lower_squares(hits[h, 0] + half, hits[h, 1] + half, seen)
+    for i in range(len(grid)):
         row = grid[i]
-        for j in range(size):
+        for j in range(len(row)):
             row[j] = math.sqrt(row[j])
 
 
 @kernel
-def _find_span(middle: float, reach: float, cell: float, size: int) -> tuple[int, int]:
+def _lower_squares(x: float, y: float, seen: LocalMap) -> None:
+    """Lowers squared distances to those from a hit, given from the map's corner [m]."""
+    cell = seen.cell
+    left, right = _find_span(x, seen)
+    low, high = _find_span(y, seen)
+    first = np.float32((left + 0.5) * cell - x)
+    for i in range(low, high):
+        dy = np.float32((i + 0.5) * cell - y)
+        row = seen.distances[i, left:right]
+        for j in range(len(row)):
+            dx = np.float32(j) * np.float32(cell) + first
+            away = dx * dx + dy * dy
+            row[j] = away if away < row[j] else row[j]
+
+
+@kernel
+def _find_span(middle: float, seen: LocalMap) -> tuple[int, int]:
     """Returns the range (first, last + 1) of cells within `reach` of a coordinate [m]."""
-    low = min(max(int((middle - reach) / cell), 0), size)
-    return low, max(min(int((middle + reach) / cell) + 1, size), low)
+    size = len(seen.distances)
+    low = min(max(int((middle - seen.reach) / seen.cell), 0), size)
+    return low, max(min(int((middle + seen.reach) / seen.cell) + 1, size), low)
 
 
 @kernel
@@ -176,33 +177,52 @@ def find_ways(around: Situation) -> None:
 
     Solves the eikonal equation by fast sweeping (Zhao 2005). Beyond the map, paths are straight.
     """
-    seen = around.map
-    goal = around.goal
-    soft = around.clearance.soft
-    ways = seen.ways
-    side = COARSE * seen.cell
-    size = len(ways)
-    half = 0.5 * size * side
-    blocked = around.outline.inner + around.clearance.margin
-    inside = max(abs(goal[0]), abs(goal[1])) < half - side
-    for i in range(size):
-        y = (i + 0.5) * side - half
-        for j in range(size):
-            x = (j + 0.5) * side - half
-            away = interpolate(seen.distances, seen.cell, x, y, seen.reach)
-            near = min(max((blocked + soft - away) / soft, 0.0), 1.0)
-            price = BLOCKED if away < blocked else 1.0 + NEAR * near * near
-            around.prices[i, j] = price * side
-            edge = i == 0 or j == 0 or i == size - 1 or j == size - 1
-            gap = math.hypot(goal[0] - x, goal[1] - y)
-            is_start = gap < 1.5 * side if inside else edge
-            ways[i, j] = gap if is_start else np.inf
+    _price_cells(around)
+    _start_ways(around.map, around.goal)
+    ways = around.map.ways
     for _ in range(ROUNDS):
         most = np.float32(0.0)
         for turn in range(4):
             most = max(most, update_ways(ways, around.prices, turn & 1, turn >> 1))
         if most < SETTLED_M:
             break
+
+
+@kernel
+def _price_cells(around: Situation) -> None:
+    """Writes the cost of crossing each cell: its side, more near hits [m]."""
+    seen = around.map
+    soft = around.clearance.soft
+    side = COARSE * seen.cell
+    size = len(around.prices)
+    half = 0.5 * size * side
+    blocked = around.outline.inner + around.clearance.margin
+    for i in range(size):
+        y = (i + 0.5) * side - half
+        for j in range(size):
+            x = (j + 0.5) * side - half
+            away = interpolate(seen.distances, seen.cell, x, y, seen.reach)
+            near = min(max((blocked + soft - away) / soft, 0.0), 1.0)
+            around.prices[i, j] = side * (
+                BLOCKED if away < blocked else 1.0 + NEAR * near * near
+            )
+
+
+@kernel
+def _start_ways(seen: LocalMap, goal: Array) -> None:
+    """Writes the straight path lengths around the goal, or at the edge if it is beyond the map."""
+    side = COARSE * seen.cell
+    size = len(seen.ways)
+    half = 0.5 * size * side
+    inside = max(abs(goal[0]), abs(goal[1])) < half - side
+    for i in range(size):
+        y = (i + 0.5) * side - half
+        for j in range(size):
+            x = (j + 0.5) * side - half
+            gap = math.hypot(goal[0] - x, goal[1] - y)
+            edge = i == 0 or j == 0 or i == size - 1 or j == size - 1
+            is_start = gap < 1.5 * side if inside else edge
+            seen.ways[i, j] = gap if is_start else np.inf
 
 
 @kernel

@@ -154,46 +154,43 @@ def fit_command(twist: Array, plant: Plant, lanes: RollOuts) -> None:
     Coordinate descent on the squared difference.
     """
     held = lanes.held
-    x = lanes.x_single
-    dq = lanes.rate
-    terms = plant.single
-    count = plant.settled.shape[1]
+    rate = lanes.rate
+    count = len(held)
     for c in range(count):
         held[c] = min(max(0.0, plant.low[c]), plant.high[c])
     for _ in range(PASSES):
         for c in range(count):
-            _settle(held, plant, lanes)
-            rates(dq, x, terms)
+            _settle(plant, lanes)
             for i in range(3):
-                lanes.reached[i] = dq[i]
+                lanes.reached[i] = rate[i]
             step = 1e-3 * (plant.high[c] - plant.low[c])
             held[c] += step
-            _settle(held, plant, lanes)
-            rates(dq, x, terms)
+            _settle(plant, lanes)
             held[c] -= step
             size = 0.0
             gain = 0.0
             for i in range(3):
-                slope = (dq[i] - lanes.reached[i]) / step
+                slope = (rate[i] - lanes.reached[i]) / step
                 size += slope * slope
                 gain += slope * (twist[i] - lanes.reached[i])
             value = held[c] + gain / (size + EASE)
             held[c] = min(max(value, plant.low[c]), plant.high[c])
-    _settle(held, plant, lanes)
+    _settle(plant, lanes)
 
 
 @kernel
-def _settle(command: Array, plant: Plant, lanes: RollOuts) -> None:
-    """Writes the steady state of a command (C,) and its effect into `one`."""
+def _settle(plant: Plant, lanes: RollOuts) -> None:
+    """Writes the steady state of the held command, the command's effect, and the rates."""
     states, count = plant.settled.shape
     x = lanes.x_single
     for s in range(states):
         x[s] = 0.0
         for c in range(count):
-            x[s] += plant.settled[s, c] * command[c]
+            x[s] += plant.settled[s, c] * lanes.held[c]
     for c in range(count):
-        x[states + c] = apply_curve(command[c], plant.single.curves[c])
+        x[states + c] = apply_curve(lanes.held[c], plant.single.curves[c])
     x[states + count] = 1.0
+    rates(lanes.rate, x, plant.single)
 
 
 @kernel
@@ -202,23 +199,9 @@ def _roll_out(
 ) -> int:
     """Rolls out the actions of all lanes; writes their costs and returns the cheapest lane."""
     _begin(plant, lanes)
-    states = len(plant.settled)
-    periods = len(sampling.between)
     limit = maps.find_contact_limit(around)
-    for t in range(periods + sampling.stop):
-        for c in range(len(plant.low)):
-            row = lanes.x[states + c]
-            curve = plant.single.curves[c]
-            if t < periods:
-                middle = 0.5 * (plant.low[c] + plant.high[c])
-                half = 0.5 * (plant.high[c] - plant.low[c])
-                for k in range(len(row)):
-                    action = 0.0
-                    for q in range(len(lanes.nominal)):
-                        action += sampling.between[t, q] * lanes.actions[k, q, c]
-                    row[k] = apply_curve(middle + half * action, curve)
-            elif not sampling.holds[c]:
-                row[:] = apply_curve(sampling.rest[c], curve)
+    for t in range(len(sampling.between) + sampling.stop):
+        _give_commands(t, plant, sampling, lanes)
         run(
             lanes.pose,
             lanes.x,
@@ -237,6 +220,24 @@ def _roll_out(
         if lanes.cost[k] < lanes.cost[best]:
             best = k
     return best
+
+
+@kernel
+def _give_commands(t: int, plant: Plant, sampling: Sampling, lanes: RollOuts) -> None:
+    """Writes the effect of each lane's commands in period t, or of those that stop the robot."""
+    for c in range(len(plant.low)):
+        row = lanes.x[len(plant.settled) + c]
+        curve = plant.single.curves[c]
+        if t < len(sampling.between):
+            middle = 0.5 * (plant.low[c] + plant.high[c])
+            half = 0.5 * (plant.high[c] - plant.low[c])
+            for k in range(len(row)):
+                action = 0.0
+                for q in range(len(lanes.nominal)):
+                    action += sampling.between[t, q] * lanes.actions[k, q, c]
+                row[k] = apply_curve(middle + half * action, curve)
+        elif not sampling.holds[c]:
+            row[:] = apply_curve(sampling.rest[c], curve)
 
 
 @kernel
