@@ -102,8 +102,6 @@ def make_verdict(results: DemoResults) -> Sequence[str]:
     """Returns the fit, the success in three worlds, and the next step."""
     summary = results.summaries[AS_IT_IS]
     success = summary.success
-    count = len(results.there)
-    here = f"in process, {successes(results.here)} of the same {count}"
     between = f"95 % confidence: {100 * success.low:.1f} to {100 * success.high:.1f} %"
     tiles = [
         fit_tile(results.identified),
@@ -112,15 +110,8 @@ def make_verdict(results: DemoResults) -> Sequence[str]:
             f"of {summary.episodes} unseen episodes succeed in the fast simulator ({between})",
             success.value >= GOOD,
         ),
+        *_make_node_tiles(results),
     ]
-    if results.live is not None:
-        reached = successes(results.there)
-        is_good = reached >= GOOD * count
-        end = "arrived" if results.arrived else "did not arrive"
-        tiles += [
-            (f"{reached} of {count}", f"episodes succeed over DDS; {here}", is_good),
-            (end, "deployed, in real time", results.arrived),
-        ]
     conclusion = conclude(results.identified)
     if conclusion.ready:
         next_step = "train longer, with --train-steps"
@@ -136,6 +127,24 @@ def make_verdict(results: DemoResults) -> Sequence[str]:
         f"nics evaluate {driven}",
         "nics demo --recording DRIVE --robot ROBOT.yaml  # your own robot",
     )
+
+
+def _make_node_tiles(results: DemoResults) -> list[tuple[str, str, bool]]:
+    """Returns the tiles of the episodes over DDS and of the deployment, if there were any."""
+    if results.live is None:
+        return []
+    count = len(results.there)
+    reached = successes(results.there)
+    here = f"in process, {successes(results.here)} of the same {count}"
+    end = "arrived" if results.arrived else "did not arrive"
+    return [
+        (
+            f"{reached} of {count}",
+            f"episodes succeed over DDS; {here}",
+            reached >= GOOD * count,
+        ),
+        (end, "deployed, in real time", results.arrived),
+    ]
 
 
 def _make_policy_lines(results: DemoResults) -> list[str]:

@@ -91,23 +91,31 @@ class Demo:
         results = DemoResults(
             plan, model, identified, learned, summaries, here, [], None
         )
-        paths = plan.out / "paths.png"  # the report takes a while
-        write_bytes(paths, results.draw_trajectories({LABELS[FAST]: here}))
-        self._say(f"  the paths are drawn in {paths}")
+        self._draw_paths(results)
         over = ""
         if topics:
-            there = self._time("driving over DDS", self._drive, DDS, policy)
-            reached = [each.seed for each in there if each.result == "success"]
-            live = self._time(
-                "deploying", self._deploy, model, policy, [*reached, 0][0]
-            )
-            results = replace(results, there=there, live=live)
-            over = f"over DDS {successes(there)}/{plan.episodes}, "
+            results = self._drive_nodes(results)
+            over = f"over DDS {successes(results.there)}/{plan.episodes}, "
         file = plan.out / "report.html"
         self._write_report(file, results)
         return (
             f"demo: in process {successes(here)}/{plan.episodes}, {over}report {file}"
         )
+
+    def _draw_paths(self, results: DemoResults) -> None:
+        """Draws the paths in process, because the report takes a while."""
+        paths = self._plan.out / "paths.png"
+        write_bytes(paths, results.draw_trajectories({LABELS[FAST]: results.here}))
+        self._say(f"  the paths are drawn in {paths}")
+
+    def _drive_nodes(self, results: DemoResults) -> DemoResults:
+        """Returns the results with the same episodes over DDS, and one by the deployed nodes."""
+        policy = results.learned.policy
+        there = self._time("driving over DDS", self._drive, DDS, policy)
+        reached = [each.seed for each in there if each.result == "success"]
+        seed = [*reached, 0][0]
+        live = self._time("deploying", self._deploy, results.model, policy, seed)
+        return replace(results, there=there, live=live)
 
     def _time(self, name: str, part: Callable[..., R], *arguments: Any) -> R:
         begin = time.perf_counter()
@@ -216,9 +224,11 @@ class Demo:
         command = f"nics demo --robot {plan.robot or model.robot.name}"
         result = SeedResult(TRAINING_SEED, trained, {})
         export(model, settings, result, command, file)
-        spent = f"{trained.stepping_s:.0f} s of {trained.wall_s:.0f} s in the simulator"
-        how = "PPO learned it from scratch in the generated simulator"
-        return Learned(str(file), f"{how}: {trained.steps:,} steps, {spent}.", curve)
+        how = (
+            f"PPO learned it from scratch in the generated simulator: {trained.steps:,} steps, "
+            f"{trained.stepping_s:.0f} s of {trained.wall_s:.0f} s in the simulator."
+        )
+        return Learned(str(file), how, curve)
 
     def _evaluate(self, model: SimulatorModel, name: str) -> dict[str, Summary]:
         self._say(
@@ -230,20 +240,14 @@ class Demo:
         summaries = {}
         conditions = {AS_IT_IS: None, **load_randomisation(PERTURBED).alone()}
         for condition, drawn in conditions.items():
-            options: dict[str, Any] = {
-                "max_episode_steps": limit,
-                "randomisation": drawn,
-            }
-            env = BridgeVectorEnv(MANY, model, world, task, **options)
+            env = BridgeVectorEnv(
+                MANY, model, world, task, max_episode_steps=limit, randomisation=drawn
+            )
             seeds = range(FIRST_SEED, FIRST_SEED + MANY)
             outcomes = evaluation.drive_worlds(env, policy.act, seeds)
             summary = evaluation.summarise(outcomes, model.control_period)
             summaries[condition] = summary
-            shares = ", ".join(
-                f"{result} {100 * share.value:.1f} %"
-                for result, share in summary.shares.items()
-            )
-            self._say(f"  {condition.replace('_', ' ')}: {shares}")
+            self._say(f"  {condition.replace('_', ' ')}: {_format_shares(summary)}")
         return summaries
 
     def _drive(self, place: str, policy: str) -> list[Episode]:
@@ -327,6 +331,13 @@ class Demo:
             for process in processes:
                 process.check()
             return arrived, witness.path
+
+
+def _format_shares(summary: Summary) -> str:
+    return ", ".join(
+        f"{result} {100 * share.value:.1f} %"
+        for result, share in summary.shares.items()
+    )
 
 
 def _write_limits(robot: RobotSpec, path: Path) -> Path:

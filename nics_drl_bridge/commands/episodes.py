@@ -284,8 +284,6 @@ class Evaluated:
 
 def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     """Drives all policies through the same episodes everywhere; writes results and pictures."""
-    seeds = order.seeds
-    logs = order.out / "logs"
     contracts = read_contracts(order.policies, order.model)
     model, name = order.conditions.model(model_name(order.model, contracts), order.out)
     world = load_worlds(order.world)
@@ -303,7 +301,15 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
                 tell(what, episode.seed - order.seed + 1, order.episodes)
 
             runs[place] = drive_in(
-                place, policy, name, order.world, seeds, logs, on_episode, say, limited
+                place,
+                policy,
+                name,
+                order.world,
+                order.seeds,
+                order.out / "logs",
+                on_episode,
+                say,
+                limited,
             )
         evaluated.append(
             judge_runs(
@@ -522,69 +528,111 @@ def drive_vehicle(
     without `confirm`, such a goal is refused. Raises BackendError if the vehicle does not answer or
     does not fit its model, ConfigError if a goal is refused.
     """
-    policy = order.policies[0]
-    contracts = read_contracts(order.policies, order.model)
-    name = model_name(order.model, contracts)
-    model = open_model(name)
-    world = load_worlds(order.world)
-    radius = model.robot.footprint_radius
-    scenes = [sample_scene(world, radius, seed) for seed in order.seeds]
-    if not goals.needs_pose:  # refuse far goals before the operator has to wait
-        planned = map(goals.episode, scenes)
-        max(planned, key=lambda episode: episode.distance).confirm(confirm)
-    conditions = limit_time(order.conditions, contracts, model, world, say)
-    # A policy that does not fit must be refused before anything moves.
-    open_policy(policy, model, conditions.kind)
-    namespace = options.get("namespace", "")
-    _examine_vehicle(model, namespace, options.get("imu", defaults.IMU_TOPIC), say)
-    ground = goals.ground(world)
-    fixed = {"mode": "realtime", "vehicle": True, "command_topic": RAW, "say": say}
-    options |= {"start": goals.start, "lays_map": goals.lays_map}
-    backend = make_backend("dds", model, ground, **fixed, **options)
-    env, driver = make_env(backend, policy, model, ground, conditions)
-    episodes = list[Episode]()
-    last = "" if arm else f"; arm {GATE}"
-    with closing(env):
-        for seed, scene in zip(order.seeds, scenes, strict=True):
-            question = f"episode {len(episodes) + 1} of {order.episodes}: {{}}{last}"
-            episode = _agree_on_episode(
-                goals, scene, backend.present_pose, question, ask, confirm
+    return _VehicleDrive(order, goals, say, ask, confirm, arm).run(options)
+
+
+class _VehicleDrive:
+    """Drives the episodes of an order on the vehicle; see `drive_vehicle`."""
+
+    def __init__(
+        self,
+        order: EvaluationOrder,
+        goals: GoalOrder,
+        say: Say,
+        ask: Say,
+        confirm: Say | None,
+        arm: bool,
+    ) -> None:
+        self._order = order
+        self._goals = goals
+        self._say = say
+        self._ask = ask
+        self._confirm = confirm
+        self._arm = arm
+        self._policy = order.policies[0]
+        contracts = read_contracts(order.policies, order.model)
+        self._name = model_name(order.model, contracts)
+        self._model = open_model(self._name)
+        self._world = load_worlds(order.world)
+        self._scenes = self._draw_scenes()
+        self._conditions = limit_time(
+            order.conditions, contracts, self._model, self._world, say
+        )
+
+    def _draw_scenes(self) -> list[Scene]:
+        """Draws the episodes; refuses far goals before the operator has to wait."""
+        radius = self._model.robot.footprint_radius
+        scenes = [sample_scene(self._world, radius, seed) for seed in self._order.seeds]
+        if not self._goals.needs_pose:
+            planned = map(self._goals.episode, scenes)
+            farthest = max(planned, key=lambda episode: episode.distance)
+            farthest.confirm(self._confirm)
+        return scenes
+
+    def run(self, options: dict[str, Any]) -> Evaluated:
+        """Drives everything, and writes the results; `options` are those of the backend."""
+        order = self._order
+        model = self._model
+        # A policy that does not fit must be refused before anything moves.
+        open_policy(self._policy, model, self._conditions.kind)
+        imu = options.get("imu", defaults.IMU_TOPIC)
+        _examine_vehicle(model, options.get("namespace", ""), imu, self._say)
+        runs = {VEHICLE: self._drive(options)}
+        try:
+            runs[FAST] = _drive_again(
+                runs[VEHICLE], self._policy, model, order.world, self._conditions
             )
-            begin = partial(_arm, arm, namespace, say)
-            driven = drive(env, driver, seed, episode.options, begin)
-            # Only the vehicle's own estimate of its path is known.
-            episodes.append(replace(driven, path=driven.estimate))
-            say(f"  {report_end(episodes[-1])}")
-    runs = {VEHICLE: episodes}
-    try:
-        runs[FAST] = _drive_again(episodes, policy, model, order.world, conditions)
-    except ConfigError as error:  # the start may be inside a wall of the map
-        say(f"  not driven again in process: {error}")
-    result = judge_runs(policy, runs, model, world, order.out)
-    write_evaluation(replace(order, conditions=conditions), name, model, [result])
-    return result
+        except ConfigError as error:  # the start may be inside a wall of the map
+            self._say(f"  not driven again in process: {error}")
+        result = judge_runs(self._policy, runs, model, self._world, order.out)
+        driven = replace(order, conditions=self._conditions)
+        write_evaluation(driven, self._name, model, [result])
+        return result
 
+    def _drive(self, options: dict[str, Any]) -> list[Episode]:
+        """Drives the vehicle; only its own estimate of its path is known."""
+        goals = self._goals
+        ground = goals.ground(self._world)
+        fixed = {"mode": "realtime", "vehicle": True, "command_topic": RAW}
+        fixed |= {"say": self._say, "start": goals.start, "lays_map": goals.lays_map}
+        backend = make_backend("dds", self._model, ground, **fixed, **options)
+        env, driver = make_env(
+            backend, self._policy, self._model, ground, self._conditions
+        )
+        begin = partial(_arm, self._arm, options.get("namespace", ""), self._say)
+        episodes = list[Episode]()
+        with closing(env):
+            for seed, scene in zip(self._order.seeds, self._scenes, strict=True):
+                episode = self._agree_on_episode(
+                    scene, backend.present_pose, len(episodes) + 1
+                )
+                driven = drive(env, driver, seed, episode.options, begin)
+                episodes.append(replace(driven, path=driven.estimate))
+                self._say(f"  {report_end(episodes[-1])}")
+        return episodes
 
-def _agree_on_episode(
-    goals: GoalOrder,
-    scene: Scene,
-    find_pose: Callable[[], Array],
-    question: str,
-    ask: Say,
-    confirm: Say | None,
-) -> VehicleEpisode:
-    """Asks for the start of an episode, and for confirmation of a far goal; returns it."""
-    if not goals.needs_pose:
-        episode = goals.episode(scene)
-        ask(question.format(episode.sentence()))
+    def _agree_on_episode(
+        self, scene: Scene, find_pose: Callable[[], Array], number: int
+    ) -> VehicleEpisode:
+        """Asks for the start of an episode, and for confirmation of a far goal; returns it."""
+        goals = self._goals
+
+        def ask(asked: VehicleEpisode) -> None:
+            last = "" if self._arm else f"; arm {GATE}"
+            which = f"episode {number} of {self._order.episodes}"
+            self._ask(f"{which}: {asked.sentence()}{last}")
+
+        if not goals.needs_pose:
+            episode = goals.episode(scene)
+            ask(episode)
+            return episode
+        asked = goals.episode(scene, find_pose())
+        asked.confirm(self._confirm)
+        ask(asked)
+        episode = goals.episode(scene, find_pose())
+        if episode.distance > asked.distance + NEAR_M:  # it was moved in the meantime
+            episode.confirm(self._confirm)
         return episode
-    asked = goals.episode(scene, find_pose())
-    asked.confirm(confirm)
-    ask(question.format(asked.sentence()))
-    episode = goals.episode(scene, find_pose())
-    if episode.distance > asked.distance + NEAR_M:  # it was moved in the meantime
-        episode.confirm(confirm)
-    return episode
 
 
 ENDS_BELIEVED = {"success": "reached", "collision": "touched"}

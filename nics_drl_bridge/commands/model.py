@@ -19,6 +19,7 @@ from nics_drl_bridge.nodes.parameters import STAMPED
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
+    from nics_drl_bridge.generator import SimulatorModel
     from nics_drl_bridge.identify.identify import Identified
     from nics_drl_bridge.recording.excite import DrivePlan
     from nics_drl_bridge.recording.recording import Recording
@@ -357,8 +358,7 @@ def generate(
     chosen = choose_mapping(load_topic_roles(topics, topic or ()), mapping)
     with console.show_progress(f"reading {named}"):
         spec, drives = open_drives(recording, robot, chosen)
-    pairs = zip(drives, names_of_sources(recording), strict=True)
-    drives = [replace(drive, source=name) for drive, name in pairs]
+    drives = _name_drives(drives, recording)
     with console.show_progress("generating"):
         model, identified = generate_model(
             drives if len(drives) > 1 else drives[0],
@@ -373,7 +373,6 @@ def generate(
             sensors,
         )
         save_model(model, out)
-    from nics_drl_bridge.identify.report import format_opening
     from nics_drl_bridge.report.fit_page import write_fit_page
     from nics_drl_bridge.report.fit_pictures import write_pictures
 
@@ -381,16 +380,38 @@ def generate(
         write_fit_page(out / "report.html", named, spec, identified, model.report)
         if pictures:
             write_pictures(spec, identified, out / "pictures")
-    why = "" if lidar or spec.lidar else ", the default; choose another with --lidar"
+    default = not (lidar or spec.lidar)
+    console.print_line(
+        as_json,
+        _describe_written(out, model, identified, default),
+        **fit_facts(out, spec.name, identified),
+    )
+
+
+def _name_drives(
+    drives: Sequence["Recording"], recordings: Sequence[Path]
+) -> list["Recording"]:
+    """Returns drives with the names of their recordings as sources."""
+    names = names_of_sources(recordings)
+    return [
+        replace(drive, source=name) for drive, name in zip(drives, names, strict=True)
+    ]
+
+
+def _describe_written(
+    out: Path, model: "SimulatorModel", identified: "Identified", default: bool
+) -> str:
+    """Returns what to print about a written model; `default`: nobody chose its lidar."""
+    from nics_drl_bridge.identify.report import format_opening
+
+    why = ", the default; choose another with --lidar" if default else ""
     lines = (
         f"{format_opening(identified.recording.source, identified)}\n",
         f"its lidar is {model.lidar.name!r}{why}",
         f"all figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}",
         f"model written to {out}",
     )
-    console.print_line(
-        as_json, "\n".join(lines), **fit_facts(out, spec.name, identified)
-    )
+    return "\n".join(lines)
 
 
 def names_of_sources(recordings: Sequence[Path]) -> list[str]:

@@ -3,7 +3,7 @@
 import math
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -87,27 +87,19 @@ def train(
     ] = False,
 ) -> None:
     """Trains policies in the fast simulator, and evaluates them."""
-    choices = {"robot": robot, "algorithm": algorithm, "steps": steps, "world": world}
-    choices["engine"] = engine if engine in OWN else None
-    named = {name: value for name, value in choices.items() if value}
-    if resume and (settings or named):
-        option = next(iter(named), "settings")
-        raise ConfigError(
-            f"--{option}: a resumed run has its own settings; leave it out."
-        )
-    if resume and out is None:
-        raise ConfigError("--resume requires --out, the folder of the run to continue.")
-    if resume and out is not None and not (out / "settings.yaml").is_file():
-        fix = "name the folder of a run with --out"
-        raise ConfigError(f"{out}: contains no settings.yaml; {fix}.")
-    if watch and engine is not None and engine not in OWN:
-        reason = (
-            "worlds of other processes are not shown; leave out --watch, or --engine"
-        )
-        raise ConfigError(f"--watch --engine {engine}: {reason}.")
+    named = _keep_given(
+        robot=robot,
+        algorithm=algorithm,
+        steps=steps,
+        world=world,
+        engine=engine if engine in OWN else None,
+    )
+    if resume:
+        _check_resumed(out, bool(settings), named)
+    if watch:
+        _check_watched(engine)
     further_seeds = seeds_of_words(more_seeds or [], seeds is not None)
-    every_seed = [*(seeds or []), *further_seeds]
-    check_training(task, robot, world or [], every_seed, out)
+    check_training(task, robot, world or [], [*(seeds or []), *further_seeds], out)
     check_engine(engine, {"address": address, "env-runners": env_runners})
     if (settings or algorithm) and not resume:
         check_settings(task, settings, named)
@@ -121,14 +113,20 @@ def train(
     else:
         chosen, opened = _load_settings(task, settings, named)
     folder = out or Path("runs") / chosen.title
-    command = shlex.join(["nics", *sys.argv[1:]])
     started = train_run.seeds_of(folder) if resume and not seeds else []
     if started:
         typer.echo(
             f"continuing the seeds {started}; choose others with --seeds", err=True
         )
     all_seeds = [*(seeds or started or [0]), *further_seeds]
-    order = train_run.TrainOrder(chosen, all_seeds, folder, episodes, resume, command)
+    order = train_run.TrainOrder(
+        chosen,
+        all_seeds,
+        folder,
+        episodes,
+        resume,
+        command=shlex.join(["nics", *sys.argv[1:]]),
+    )
     resume_command = make_resume_command(
         folder,
         all_seeds,
@@ -142,8 +140,38 @@ def train(
         report_interruption(folder, resume_command, train_run.seeds_of),
         _open_learner(engine, address, env_runners, chosen.num_envs) as learn,
     ):
-        run = partial(train_run.run, opened=opened)
-        (_run_watched if watch else _run)(run, order, learn, as_json)
+        show = _run_watched if watch else _run
+        show(partial(train_run.run, opened=opened), order, learn, as_json)
+
+
+def _keep_given(**options: object) -> dict[str, Any]:
+    """Returns the options that were given."""
+    return {name: value for name, value in options.items() if value}
+
+
+def _check_watched(engine: str | None) -> None:
+    """Raises ConfigError for an engine whose worlds can't be shown."""
+    if engine is not None and engine not in OWN:
+        reason = (
+            "worlds of other processes are not shown; leave out --watch, or --engine"
+        )
+        raise ConfigError(f"--watch --engine {engine}: {reason}.")
+
+
+def _check_resumed(
+    out: Path | None, has_settings: bool, named: Mapping[str, Any]
+) -> None:
+    """Raises ConfigError unless a run can be resumed, with its own settings."""
+    if has_settings or named:
+        option = next(iter(named), "settings")
+        raise ConfigError(
+            f"--{option}: a resumed run has its own settings; leave it out."
+        )
+    if out is None:
+        raise ConfigError("--resume requires --out, the folder of the run to continue.")
+    if not (out / "settings.yaml").is_file():
+        fix = "name the folder of a run with --out"
+        raise ConfigError(f"{out}: contains no settings.yaml; {fix}.")
 
 
 def make_resume_command(

@@ -194,7 +194,8 @@ def _read_standing(
 ) -> Written:
     """Returns the world of the obstacles in an SDF file."""
     at = [keys[key]["at"][0] for key in ("starts", "goals") if key in keys]
-    x1, y1, x2, y2 = field = keys.get("bounds") or standing.bounds(*at)
+    field = keys.get("bounds") or standing.bounds(*at)
+    size = (field[2] - field[0], field[3] - field[1])
     groups = [
         {"shapes": [group.shapes[0].model_dump(exclude_none=True)], "at": group.at}
         for group in standing.obstacles
@@ -202,9 +203,9 @@ def _read_standing(
     head = [f"Obstacles of {file.name} at a height of {height:g} m."]
     head += [f"Left out: {reason}." for reason in standing.left_out]
     derived = {"name": file.stem, "bounds": field, "obstacles": groups}
-    text = _format_world(file, head, derived | keys, (x2 - x1, y2 - y1))
+    text = _format_world(file, head, derived | keys, size)
     line = (
-        f"obstacles: {len(standing.placed)}, field: {x2 - x1:.4g} m x {y2 - y1:.4g} m"
+        f"obstacles: {len(standing.placed)}, field: {size[0]:.4g} m x {size[1]:.4g} m"
     )
     return Written(place, text, "\n  left out: ".join([line, *standing.left_out]))
 
@@ -235,11 +236,10 @@ def _read_mapped(
         raise ConfigError(
             f"{file}: there is no {map_file.name} beside the picture; {fix}."
         )
-    x = columns * resolution
-    y = rows * resolution
+    size = (columns * resolution, rows * resolution)
     derived = {"name": file.stem, "map": _locate_from(place, map_file)}
-    text = _format_world(file, [f"The map {map_file.name}."], derived | keys, (x, y))
-    return [*files, Written(place, text, f"map: {x:.4g} m x {y:.4g} m")]
+    text = _format_world(file, [f"The map {map_file.name}."], derived | keys, size)
+    return [*files, Written(place, text, f"map: {size[0]:.4g} m x {size[1]:.4g} m")]
 
 
 def _locate_from(place: Path, file: Path) -> str:
@@ -381,8 +381,7 @@ def map_(
     file = out or Path(Path(f"{opened.name}_map.yaml").name)
     check_suffix("--out", file, *MAPS)
     _check_overwrite(worlds, Path(name), file, file.with_suffix(".pgm"))
-    bodies = standing(sampler, member, scenes[0].bodies)
-    grid = occupancy(opened, bodies, resolution)
+    grid = occupancy(opened, standing(sampler, member, scenes[0].bodies), resolution)
     map_files(grid, file)
     rows, columns = grid.cells.shape
     size = f"{columns} x {rows} cells of {grid.resolution:.4g} m"

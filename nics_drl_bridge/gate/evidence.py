@@ -146,30 +146,29 @@ def estimate_motion(
         return by_odometry
     stride = math.ceil(len(new.ranges) / COMPARED_BEAMS)
     is_return = np.isfinite(new.ranges[::stride])
-    compared = len(is_return)
 
     def find_agreeing(motion: Array) -> Flags:
-        agreeing = np.empty(compared, np.bool_)
+        agreeing = np.empty(len(is_return), np.bool_)
         evidence_kernels.mark_agreeing(
             agreeing, new.ranges, old.ranges, lidar, motion, tolerance, stride
         )
         return agreeing
 
-    agreeing_by_odometry = find_agreeing(by_odometry)
+    usual = find_agreeing(by_odometry)
     needed = max(
-        np.count_nonzero(agreeing_by_odometry) + MIN_GAIN * compared,
-        MIN_AGREEING * compared,
+        np.count_nonzero(usual) + MIN_GAIN * len(usual), MIN_AGREEING * len(usual)
     )
     if np.count_nonzero(is_return) < needed:
         return by_odometry  # no motion can fit better
     motions = np.concatenate([_vary_turn(by_odometry), _lessen_motion(by_odometry)])
-    agreeing = np.stack([find_agreeing(motion) for motion in motions])
-    counts = np.count_nonzero(agreeing, axis=1)
-    best = int(np.argmax(counts))  # among equals, the turn closest to odometry's
-    gained = np.flatnonzero(agreeing[best] & ~agreeing_by_odometry) * stride
-    if counts[best] < needed or _count_sectors(gained, lidar) < MIN_SECTORS:
+    # among equals, the turn closest to odometry's
+    best = max(motions, key=lambda motion: np.count_nonzero(find_agreeing(motion)))
+    agreeing = find_agreeing(best)
+    gained = np.flatnonzero(agreeing & ~usual) * stride
+    is_better = np.count_nonzero(agreeing) >= needed
+    if not is_better or _count_sectors(gained, lidar) < MIN_SECTORS:
         return by_odometry
-    by_scans: Array = motions[best]
+    by_scans: Array = best
     return by_scans
 
 

@@ -22,7 +22,7 @@ from nics_drl_bridge.gate.footprint import get_body
 from nics_drl_bridge.gate.ground_kernels import Grid
 from nics_drl_bridge.gate.shield_kernels import Body
 from nics_drl_bridge.gate.state import GateConfig, Ground, Ranges, ShieldConfig, View
-from nics_drl_bridge.interface import S_PER_NS
+from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.sim.collision_kernels import Outline
 
 CELL = 0.05  # width of a cell [m]
@@ -72,17 +72,9 @@ def observe_ground(
         body: footprint of the robot, and the margin around it.
         range_max: of the lidar [m].
     """
-    x, y, heading = view.pose.tolist()
     kept_radius = body.radius + body.margin + CELL
     count = max(CELLS, 2 * math.ceil((kept_radius + REACH_BEYOND) / CELL))
-    corner = (math.floor(x / CELL) - count // 2, math.floor(y / CELL) - count // 2)
-    grid = Grid(
-        x=corner[0] * CELL - x,
-        y=corner[1] * CELL - y,
-        width=CELL,
-        cosine=math.cos(heading),
-        sine=math.sin(heading),
-    )
+    corner, grid = _centre_cells(view.pose, count)
     if before is None:
         since_ns = view.stamp_ns
         times = np.full((count, count), -np.inf, np.float32)
@@ -91,8 +83,8 @@ def observe_ground(
         ground_kernels.mark_covered(times, grid, circle, 0.0)
     else:
         since_ns = before.since_ns
-        columns_moved, rows_moved = np.subtract(corner, before.corner).tolist()
-        times = ground_kernels.shift_cells(before.times, columns_moved, rows_moved)
+        moved = np.subtract(corner, before.corner).tolist()
+        times = ground_kernels.shift_cells(before.times, *moved)
     now = (view.stamp_ns - since_ns) * S_PER_NS
     ground_kernels.forget_old(times, grid, kept_radius, now, now - REMEMBERED_S)
     is_seen = ground_kernels.mark_seen(
@@ -101,6 +93,20 @@ def observe_ground(
     ground_kernels.mark_covered(times, grid, body, now)
     unseen = ground_kernels.find_unseen(times, is_seen, grid)
     return Ground(since_ns, corner, times, unseen)
+
+
+def _centre_cells(pose: Array, count: int) -> tuple[tuple[int, int], Grid]:
+    """Returns the first of `count` cells along each axis around a pose (3,), and their grid."""
+    x, y, heading = pose.tolist()
+    corner = (math.floor(x / CELL) - count // 2, math.floor(y / CELL) - count // 2)
+    grid = Grid(
+        x=corner[0] * CELL - x,
+        y=corner[1] * CELL - y,
+        width=CELL,
+        cosine=math.cos(heading),
+        sine=math.sin(heading),
+    )
+    return corner, grid
 
 
 def _find_nearest(ranges: Ranges, lidar: MountedBeams) -> float:

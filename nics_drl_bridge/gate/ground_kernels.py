@@ -86,13 +86,7 @@ def mark_seen(
     for i in range(times.shape[0]):
         for j in range(times.shape[1]):
             x, y = _locate_cell(i, j, grid)
-            dx = x - lidar.x
-            dy = y - lidar.y
-            distance = max(math.sqrt(dx * dx + dy * dy), grid.width)
-            middle = _find_beam(x, y, lidar)
-            half_width = math.ceil(0.5 * grid.width / (distance * abs(lidar.step)))
-            first = middle - half_width
-            last = middle + half_width
+            distance, first, last = _find_view(x, y, grid.width, lidar)
             if first < 0 or last >= beams:
                 continue
             is_seen[i, j] = True
@@ -103,6 +97,19 @@ def mark_seen(
                 times[i, j] = now
     _clear_returns(times, grid, ranges, lidar)
     return is_seen
+
+
+@kernel
+def _find_view(
+    x: float, y: float, width: float, lidar: MountedBeams
+) -> tuple[float, int, int]:
+    """Returns the distance [m] of a cell from the lidar, and the first and last beam towards it."""
+    dx = x - lidar.x
+    dy = y - lidar.y
+    distance = max(math.sqrt(dx * dx + dy * dy), width)
+    middle = _find_beam(x, y, lidar)
+    half_width = math.ceil(0.5 * width / (distance * abs(lidar.step)))
+    return distance, middle - half_width, middle + half_width
 
 
 @kernel
@@ -147,18 +154,23 @@ def find_unseen(times: Ranges, is_seen: Flags, grid: Grid) -> Array:
             is_inner = 0 < i < last_i and 0 < j < last_j
             if is_seen[i, j] or (is_inner and times[i, j] > -np.inf):
                 continue
-            has_known_neighbour = False
-            for di, dj in ((0, -1), (0, 1), (-1, 0), (1, 0)):
-                row = min(max(i + di, 0), last_i)
-                column = min(max(j + dj, 0), last_j)
-                is_known = is_seen[row, column] or times[row, column] > -np.inf
-                has_known_neighbour = has_known_neighbour or is_known
-            if has_known_neighbour:
+            if _has_known_neighbour(i, j, times, is_seen):
                 x, y = _locate_cell(i, j, grid)
                 middles[count, 0] = x
                 middles[count, 1] = y
                 count += 1
     return middles[:count].copy()
+
+
+@kernel
+def _has_known_neighbour(i: int, j: int, times: Ranges, is_seen: Flags) -> bool:
+    """True if one of the four neighbours of a cell is free or visible."""
+    for di, dj in ((0, -1), (0, 1), (-1, 0), (1, 0)):
+        row = min(max(i + di, 0), times.shape[0] - 1)
+        column = min(max(j + dj, 0), times.shape[1] - 1)
+        if is_seen[row, column] or times[row, column] > -np.inf:
+            return True
+    return False
 
 
 @kernel

@@ -232,26 +232,7 @@ def judge_motion(
         return UNDECIDED
     # Scans stamped too late show at least this fraction of a free robot's motion; see `usual_half`.
     share_scale = min(1.0, lesser_fraction / SETTINGS.usual_half)
-    mount = np.array(config.mount)
-    moved = between(compose(reference.pose, mount), compose(newest.pose, mount))
-    directions = get_directions(config)
-    predicted = np.empty_like(reference.ranges)
-    kernels.predict_scan(reference.ranges, directions, moved, SETTINGS.gap, predicted)
-    sector = round(SETTINGS.sector / directions.step) or 1
-    thresholds = Thresholds(
-        SETTINGS.min_change,
-        SETTINGS.min_deviations,
-        SETTINGS.visible_change,
-        SETTINGS.visible_deviations,
-    )
-    observed, changed = kernels.compare_sectors(
-        reference.ranges,
-        newest.ranges,
-        predicted,
-        sector,
-        compute_noise(config, directions),
-        thresholds,
-    )
+    observed, changed = _compare_scans(config, reference, newest)
     is_compared = ~np.isnan(observed)
     sectors = np.count_nonzero(is_compared)
     if sectors < SETTINGS.min_sectors:
@@ -266,6 +247,35 @@ def judge_motion(
         and np.median(changed[is_compared]) < SETTINGS.max_changed
     )
     return Verdict(share, bool(held), reference)
+
+
+def _compare_scans(
+    config: GateConfig, reference: ReducedScan, newest: ReducedScan
+) -> tuple[Array, Array]:
+    """Returns, per sector, what the newest scan shows of the motion since the reference.
+
+    See `scan_motion_kernels.compare_sectors`.
+    """
+    mount = np.array(config.mount)
+    moved = between(compose(reference.pose, mount), compose(newest.pose, mount))
+    directions = get_directions(config)
+    predicted = np.empty_like(reference.ranges)
+    kernels.predict_scan(reference.ranges, directions, moved, SETTINGS.gap, predicted)
+    thresholds = Thresholds(
+        SETTINGS.min_change,
+        SETTINGS.min_deviations,
+        SETTINGS.visible_change,
+        SETTINGS.visible_deviations,
+    )
+    compared: tuple[Array, Array] = kernels.compare_sectors(
+        reference.ranges,
+        newest.ranges,
+        predicted,
+        round(SETTINGS.sector / directions.step) or 1,
+        compute_noise(config, directions),
+        thresholds,
+    )
+    return compared
 
 
 def _select_reference(

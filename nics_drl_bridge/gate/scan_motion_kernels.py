@@ -18,6 +18,7 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.kernels import kernel
 
 Ranges = NDArray[np.float32]
+Point = tuple[float, float]  # x, y [m]
 # Maximum number of beams in a window. For a denser lidar, only the middle ones are
 # used.
 LARGEST_WINDOW = 129
@@ -118,51 +119,52 @@ def predict_scan(
         out: (K,) ranges to the nearest surface [m]; NaN in directions that none covers.
     """
     count = ranges.shape[0]
-    out[:] = math.nan
-    cosine = math.cos(moved[2])
-    sine = math.sin(moved[2])
+    out.fill(math.nan)
     pairs = count - 1
     if directions.full_circle:
         pairs = count
-    circle = 2.0 * math.pi / directions.step  # in directions
     for k in range(pairs):
         range_a = ranges[k]
         range_b = ranges[(k + 1) % count]
-        if not abs(range_a - range_b) <= gap * min(range_a, range_b):
-            continue
-        bearing = directions.first + k * directions.step
-        ax = range_a * math.cos(bearing) - moved[0]
-        ay = range_a * math.sin(bearing) - moved[1]
-        bearing += directions.step
-        bx = range_b * math.cos(bearing) - moved[0]
-        by = range_b * math.sin(bearing) - moved[1]
-        ax, ay = cosine * ax + sine * ay, cosine * ay - sine * ax
-        bx, by = cosine * bx + sine * by, cosine * by - sine * bx
-        cross = ax * by - ay * bx
-        dot = ax * bx + ay * by
-        if cross <= 0.0 or dot <= 0.0:
-            continue  # seen from behind, or around the lidar itself
-        # The directions that the surface covers, in spacings from the first one.
-        begin = (math.atan2(ay, ax) - directions.first) / directions.step
-        end = begin + math.atan2(cross, dot) / directions.step
-        shift = circle * math.floor(begin / circle)
-        begin -= shift
-        end -= shift
-        direction = math.ceil(begin)
-        while direction <= end:
-            index = direction
-            if direction >= circle - 0.5:
-                index = round(direction - circle)
-            if index < count:
-                angle = directions.first + index * directions.step
-                ux = math.cos(angle)
-                uy = math.sin(angle)
-                across = ux * (by - ay) - uy * (bx - ax)
-                if across > 0.0:
-                    length = cross / across
-                    if not out[index] <= length:  # also if it is NaN
-                        out[index] = length
-            direction += 1
+        if abs(range_a - range_b) <= gap * min(range_a, range_b):
+            bearing = directions.first + k * directions.step
+            a = _move_point(range_a, bearing, moved)
+            b = _move_point(range_b, bearing + directions.step, moved)
+            _draw_surface(out, a, b, directions)
+
+
+@kernel
+def _move_point(length: float, bearing: float, moved: Array) -> Point:
+    """Returns the end of a range [m] at a bearing [rad], in the frame after a motion (3,)."""
+    x = length * math.cos(bearing) - moved[0]
+    y = length * math.sin(bearing) - moved[1]
+    cosine = math.cos(moved[2])
+    sine = math.sin(moved[2])
+    return cosine * x + sine * y, cosine * y - sine * x
+
+
+@kernel
+def _draw_surface(out: Ranges, a: Point, b: Point, directions: Directions) -> None:
+    """Shortens the ranges (K,) in the directions that a surface from a to b covers."""
+    cross = a[0] * b[1] - a[1] * b[0]
+    dot = a[0] * b[0] + a[1] * b[1]
+    if cross <= 0.0 or dot <= 0.0:
+        return  # seen from behind, or around the lidar itself
+    circle = 2.0 * math.pi / directions.step  # in directions
+    # The directions that the surface covers, in spacings from the first one.
+    begin = (math.atan2(a[1], a[0]) - directions.first) / directions.step
+    end = begin + math.atan2(cross, dot) / directions.step
+    shift = circle * math.floor(begin / circle)
+    for direction in range(math.ceil(begin - shift), math.floor(end - shift) + 1):
+        index = direction
+        if direction >= circle - 0.5:
+            index = round(direction - circle)
+        if index < out.shape[0]:
+            angle = directions.first + index * directions.step
+            across = math.cos(angle) * (b[1] - a[1]) - math.sin(angle) * (b[0] - a[0])
+            # also if it is NaN
+            if across > 0.0 and not out[index] <= cross / across:
+                out[index] = cross / across
 
 
 @kernel(allocates=True)
@@ -198,28 +200,38 @@ def compare_sectors(
     for index in range(observed.shape[0]):
         begin = index * sector
         end = min(begin + sector, count)
-        compared = 0
-        visible = 0
-        products = 0.0
-        squares = 0.0
-        needed_squares = 0.0
-        for k in range(begin, end):
-            predicted_change = predicted[k] - old[k]
-            observed_change = new[k] - old[k]
-            if not (math.isfinite(predicted_change) and math.isfinite(observed_change)):
-                continue
-            std = noise.constant + noise.proportional * old[k]
-            needed = max(thresholds.predicted, thresholds.predicted_deviations * std)
-            if abs(observed_change) > max(
-                thresholds.visible, thresholds.visible_deviations * std
-            ):
-                visible += 1
-            limit = 2.0 * abs(predicted_change)
-            compared += 1
-            products += predicted_change * min(max(observed_change, -limit), limit)
-            squares += predicted_change * predicted_change
-            needed_squares += needed * needed
-        if 3 * compared > end - begin and squares > needed_squares:
-            observed[index] = products / squares
-            changed[index] = visible / compared
+        observed[index], changed[index] = _compare_sector(
+            old[begin:end], new[begin:end], predicted[begin:end], noise, thresholds
+        )
     return observed, changed
+
+
+@kernel
+def _compare_sector(
+    old: Ranges, new: Ranges, predicted: Ranges, noise: Noise, thresholds: Thresholds
+) -> tuple[float, float]:
+    """Returns the observed and the changed fraction of one sector; NaN and 0 if undecided."""
+    compared = 0
+    visible = 0
+    products = 0.0
+    squares = 0.0
+    needed_squares = 0.0
+    for k in range(old.shape[0]):
+        predicted_change = predicted[k] - old[k]
+        observed_change = new[k] - old[k]
+        if not (math.isfinite(predicted_change) and math.isfinite(observed_change)):
+            continue
+        std = noise.constant + noise.proportional * old[k]
+        needed = max(thresholds.predicted, thresholds.predicted_deviations * std)
+        if abs(observed_change) > max(
+            thresholds.visible, thresholds.visible_deviations * std
+        ):
+            visible += 1
+        limit = 2.0 * abs(predicted_change)
+        compared += 1
+        products += predicted_change * min(max(observed_change, -limit), limit)
+        squares += predicted_change * predicted_change
+        needed_squares += needed * needed
+    if 3 * compared > old.shape[0] and squares > needed_squares:
+        return products / squares, visible / compared
+    return math.nan, 0.0

@@ -28,6 +28,7 @@ from nics_drl_bridge.gate.arrivals import compute_age
 from nics_drl_bridge.gate.evidence import make_static
 from nics_drl_bridge.gate.evidence_kernels import MountedBeams, Tolerance
 from nics_drl_bridge.gate.footprint import get_body
+from nics_drl_bridge.gate.limits import Limits
 from nics_drl_bridge.gate.shield_kernels import Body
 from nics_drl_bridge.gate.state import (
     GateConfig,
@@ -102,45 +103,57 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     # Without a scan, the gate has already stopped.
     if limiter is None or config.limits is None or state.obstacles is None:
         return motion
-    is_speed = config.limits.linear
-    is_turn_rate = config.limits.turn
-    speed = float(np.abs(motion.value[is_speed]).max(initial=0.0))
-    turns = bool(motion.value[is_turn_rate].any())
+    limits = config.limits
+    speed = float(np.abs(motion.value[limits.linear]).max(initial=0.0))
+    turns = bool(motion.value[limits.turn].any())
     turns_on_the_spot = turns and limiter.wheelbase == 0.0
     if speed == 0.0 and not turns:
         return motion
     threats = _list_threats(config, limiter, state, now)
 
-    def scale_motion(speed_scale: float, turn_scale: float) -> Array:
-        scales = np.where(
-            is_speed, speed_scale, np.where(is_turn_rate, turn_scale, 1.0)
-        )
-        return motion.value * scales
-
     def can_stop(speed_scale: float, turn_scale: float) -> bool:
-        value = scale_motion(speed_scale, turn_scale)
+        value = _scale_command(limits, motion.value, speed_scale, turn_scale)
         return all(_is_free(config, limiter, threat, value) for threat in threats)
 
     is_creep = turns_on_the_spot and 0.0 < speed < CREEP_SPEED
     if can_stop(1.0, 1.0) and (not is_creep or can_stop(CREEP_SPEED / speed, 1.0)):
         return motion
-    # A steering angle is not scaled, so it goes on changing.
-    slope = np.where(is_speed | is_turn_rate, 0.0, motion.slope)
+    speed_scale, turn_scale = _choose_scales(can_stop, speed, turns, turns_on_the_spot)
+    # What is not scaled goes on changing, such as a steering angle.
+    is_kept = ~limits.linear & (~limits.turn | (turn_scale == 1.0))
+    return replace(
+        motion,
+        value=_scale_command(limits, motion.value, speed_scale, turn_scale),
+        slope=np.where(is_kept, motion.slope, 0.0),
+        shielded=True,
+    )
+
+
+def _scale_command(
+    limits: Limits, command: Array, speed_scale: float, turn_scale: float
+) -> Array:
+    """Returns a command (C,) with other speeds and turn rates."""
+    turn_scales = np.where(limits.turn, turn_scale, 1.0)
+    return command * np.where(limits.linear, speed_scale, turn_scales)
+
+
+def _choose_scales(
+    can_stop: Callable[[float, float], bool],
+    speed: float,
+    turns: bool,
+    turns_on_the_spot: bool,
+) -> tuple[float, float]:
+    """Returns the factors on speed and turn rate from which the robot can stop; see `shield`."""
     if turns and can_stop(0.0, 1.0):
-        turn_scale = 1.0
-        slope[is_turn_rate] = motion.slope[is_turn_rate]
-        speed_scale = _find_maximum_scale(lambda scale: can_stop(scale, 1.0))
-        if turns_on_the_spot and speed_scale * speed < CREEP_SPEED:
-            speed_scale = 0.0
-    else:
-        speed_scale = _find_maximum_scale(lambda scale: can_stop(scale, scale))
-        turn_scale = speed_scale
-        would_creep = turns_on_the_spot and speed_scale * speed < CREEP_SPEED
-        if would_creep and speed > 0.0 and can_stop(CREEP_SPEED / speed, 0.0):
-            speed_scale = _find_maximum_scale(lambda scale: can_stop(scale, 0.0))
-            turn_scale = 0.0
-    value = scale_motion(speed_scale, turn_scale)
-    return replace(motion, value=value, slope=slope, shielded=True)
+        scale = _find_maximum_scale(lambda scale: can_stop(scale, 1.0))
+        if turns_on_the_spot and scale * speed < CREEP_SPEED:
+            return 0.0, 1.0
+        return scale, 1.0
+    scale = _find_maximum_scale(lambda scale: can_stop(scale, scale))
+    would_creep = turns_on_the_spot and scale * speed < CREEP_SPEED
+    if would_creep and speed > 0.0 and can_stop(CREEP_SPEED / speed, 0.0):
+        return _find_maximum_scale(lambda scale: can_stop(scale, 0.0)), 0.0
+    return scale, scale
 
 
 def _find_maximum_scale(can_stop: Callable[[float], bool]) -> float:
@@ -172,8 +185,7 @@ def _list_threats(
         make_static(obstacles[:, :2]),
         list_stops(shield, calm_s, CALM_BRAKING, latencies=2.0),
     )
-    arrivals = [state.scans, *(sensor.arrivals for sensor in state.sensors)]
-    data_age_s = max(0.0, *(compute_age(topic, now) for topic in arrivals))
+    data_age_s = _measure_data_age(state, now)
     # Commands in effect since the oldest data, or within a reaction time before.
     since_s = now - data_age_s - _get_longest_reaction(shield)
     unshown = [command for _, command in _select_in_force(state.recent, since_s, now)]
@@ -184,6 +196,12 @@ def _list_threats(
         np.zeros(3) if state.odometry is None else state.odometry.twist,
     )
     return calm, sudden
+
+
+def _measure_data_age(state: GateState, now: float) -> float:
+    """Returns the age of the oldest newest data of lidar and sensors [s]."""
+    arrivals = [state.scans, *(sensor.arrivals for sensor in state.sensors)]
+    return max(0.0, *(compute_age(topic, now) for topic in arrivals))
 
 
 def _is_free(

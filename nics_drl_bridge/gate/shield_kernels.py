@@ -96,9 +96,26 @@ def is_free(
         deceleration: of the speed [m/s^2].
         step: maximum path of the footprint between two places [m].
     """
+    longest_path, longest_time = _bound_stops(twists, body, reaction, deceleration)
+    near = _select_near(obstacles, body, longest_path, longest_time)
+    if near.shape[0] == 0:
+        return True
+    places = np.empty((math.ceil(longest_path / step) + 1, 5))
+    for k in range(twists.shape[0]):
+        if not _is_stop_free(
+            near, places, twists[k], body, reaction, deceleration, step
+        ):
+            return False
+    return True
+
+
+@kernel
+def _bound_stops(
+    twists: Array, body: Body, reaction: float, deceleration: float
+) -> tuple[float, float]:
+    """Returns the longest path [m] and time [s] of the stops from all twists (K, 3)."""
     longest_path = 0.0
     longest_time = 0.0
-    most_steps = 0
     for k in range(twists.shape[0]):
         path, braked_speed = _bound_path(twists[k], body, reaction, deceleration)
         rest_time = _compute_rest_time(
@@ -106,53 +123,67 @@ def is_free(
         )
         longest_path = max(longest_path, path)
         longest_time = max(longest_time, rest_time)
-        most_steps = max(most_steps, math.ceil(path / step))
-    near = _select_near(obstacles, body, longest_path, longest_time)
-    if near.shape[0] == 0:
+    return longest_path, longest_time
+
+
+@kernel(allocates=True)
+def _is_stop_free(
+    near: Array,
+    all_places: Array,
+    twist: Array,
+    body: Body,
+    reaction: float,
+    deceleration: float,
+    step: float,
+) -> bool:
+    """True if a robot keeps its clearance from near obstacles (Q, 5) while it stops from a twist.
+
+    `all_places` has room for the places of the stop.
+    """
+    path, braked_speed = _bound_path(twist, body, reaction, deceleration)
+    steps = math.ceil(path / step)
+    if steps == 0:
         return True
-    all_places = np.empty((most_steps + 1, 5))
-    for k in range(twists.shape[0]):
-        path, braked_speed = _bound_path(twists[k], body, reaction, deceleration)
-        steps = math.ceil(path / step)
-        if steps == 0:
-            continue
-        places = all_places[: steps + 1]
-        duration = reaction + braked_speed / (2.0 * deceleration)
-        step_time = duration / steps
-        # Braking makes the last step longest: it moves by braked_speed * step_time, and ends at
-        # rest.
-        longest_step_time = step_time + math.sqrt(
-            2.0 * braked_speed * step_time / deceleration
+    places = all_places[: steps + 1]
+    duration = reaction + braked_speed / (2.0 * deceleration)
+    step_time = duration / steps
+    # Braking makes the last step longest: it moves by braked_speed * step_time, and ends at rest.
+    longest_step_time = step_time + math.sqrt(
+        2.0 * braked_speed * step_time / deceleration
+    )
+    is_filled = False
+    if body.turn_deceleration > 0.0:
+        is_filled = True
+        longest_step_time = _fill_places_of_separate_turn(
+            places, path, twist, braked_speed, body, reaction, deceleration
         )
-        is_filled = False
-        if body.turn_deceleration > 0.0:
+    for p in range(near.shape[0]):
+        loss_per_step = path / steps + near[p, APPROACH] * longest_step_time
+        spare = near[p, CLEARANCE] - near[p, REQUIRED]
+        s = _count_safe_steps(spare, loss_per_step, steps)
+        if s <= steps and not is_filled:
             is_filled = True
-            longest_step_time = _fill_places_of_separate_turn(
-                places, path, twists[k], braked_speed, body, reaction, deceleration
-            )
-        for p in range(near.shape[0]):
-            loss_per_step = path / steps + near[p, APPROACH] * longest_step_time
-            spare = near[p, CLEARANCE] - near[p, REQUIRED]
-            s = _count_safe_steps(spare, loss_per_step, steps)
-            if s <= steps and not is_filled:
-                is_filled = True
-                _fill_places(
-                    places, duration, twists[k], braked_speed, reaction, deceleration
-                )
-            while s <= steps:
-                dx = near[p, X] - places[s, X]
-                dy = near[p, Y] - places[s, Y]
-                cosine = places[s, COSINE]
-                sine = places[s, SINE]
-                clearance = compute_clearance(
-                    cosine * dx + sine * dy, cosine * dy - sine * dx, body
-                )
-                approached = near[p, APPROACH] * places[s, TIME]
-                spare = clearance - near[p, REQUIRED] - approached
-                if spare < 0.0:
-                    return False
-                s += _count_safe_steps(spare, loss_per_step, steps)
+            _fill_places(places, duration, twist, braked_speed, reaction, deceleration)
+        while s <= steps:
+            spare = _measure_spare(near, p, places, s, body)
+            if spare < 0.0:
+                return False
+            s += _count_safe_steps(spare, loss_per_step, steps)
     return True
+
+
+@kernel
+def _measure_spare(near: Array, p: int, places: Array, s: int, body: Body) -> float:
+    """Returns the clearance of obstacle p from place s beyond the required one [m]."""
+    dx = near[p, X] - places[s, X]
+    dy = near[p, Y] - places[s, Y]
+    cosine = places[s, COSINE]
+    sine = places[s, SINE]
+    clearance = compute_clearance(
+        cosine * dx + sine * dy, cosine * dy - sine * dx, body
+    )
+    spare: float = clearance - near[p, REQUIRED] - near[p, APPROACH] * places[s, TIME]
+    return spare
 
 
 @kernel
@@ -274,9 +305,6 @@ def _fill_places_of_separate_turn(
     `_fill_places`. Such a robot leaves its arc, so each place is reached from the
     previous one by a separate arc.
     """
-    speed = math.hypot(twist[0], twist[1])
-    turn_rate = abs(twist[2])
-    turn_reaction = reaction + body.turn_delay
     rest_time = _compute_rest_time(twist, braked_speed, body, reaction, deceleration)
     steps = len(places) - 1
     places[0] = 0.0
@@ -286,47 +314,85 @@ def _fill_places_of_separate_turn(
     turn_time = 0.0
     longest_step = 0.0
     for s in range(1, steps + 1):
-        low = time
-        high = rest_time
-        for _ in range(TIME_BISECTIONS if s < steps else 0):
-            middle = 0.5 * (low + high)
-            next_drive_time = _compute_full_speed_time(
-                middle, braked_speed, reaction, deceleration
+        next_time = rest_time
+        if s < steps:
+            next_time = _find_time(
+                path * s / steps,
+                time,
+                rest_time,
+                twist,
+                braked_speed,
+                body,
+                reaction,
+                deceleration,
             )
-            next_turn_time = _compute_full_speed_time(
-                middle, turn_rate, turn_reaction, body.turn_deceleration
-            )
-            moved = (
-                speed * next_drive_time
-                + turn_rate * body.farthest_corner * next_turn_time
-            )
-            if moved < path * s / steps:
-                low = middle
-            else:
-                high = middle
-        next_drive_time = _compute_full_speed_time(
-            high, braked_speed, reaction, deceleration
-        )
-        next_turn_time = _compute_full_speed_time(
-            high, turn_rate, turn_reaction, body.turn_deceleration
+        next_drive_time, next_turn_time = _split_time(
+            next_time, twist, braked_speed, body, reaction, deceleration
         )
         drive = next_drive_time - drive_time
         turn = next_turn_time - turn_time
-        x, y, cosine, sine = follow_arc(
-            (twist[0] * drive, twist[1] * drive, twist[2] * turn), 1.0
-        )
-        before_cosine = places[s - 1, COSINE]
-        before_sine = places[s - 1, SINE]
-        places[s, X] = places[s - 1, X] + before_cosine * x - before_sine * y
-        places[s, Y] = places[s - 1, Y] + before_sine * x + before_cosine * y
-        places[s, COSINE] = before_cosine * cosine - before_sine * sine
-        places[s, SINE] = before_sine * cosine + before_cosine * sine
-        places[s, TIME] = high
-        longest_step = max(longest_step, high - time)
-        time = high
+        _append_place(places, s, (twist[0] * drive, twist[1] * drive, twist[2] * turn))
+        places[s, TIME] = next_time
+        longest_step = max(longest_step, next_time - time)
+        time = next_time
         drive_time = next_drive_time
         turn_time = next_turn_time
     return longest_step
+
+
+@kernel
+def _split_time(
+    time: float,
+    twist: Array,
+    braked_speed: float,
+    body: Body,
+    reaction: float,
+    deceleration: float,
+) -> tuple[float, float]:
+    """Returns the times at full speed and full turn rate that move a braking robot as far [s]."""
+    drive_time = _compute_full_speed_time(time, braked_speed, reaction, deceleration)
+    turn_time = _compute_full_speed_time(
+        time, abs(twist[2]), reaction + body.turn_delay, body.turn_deceleration
+    )
+    return drive_time, turn_time
+
+
+@kernel
+def _find_time(
+    moved: float,
+    low: float,
+    high: float,
+    twist: Array,
+    braked_speed: float,
+    body: Body,
+    reaction: float,
+    deceleration: float,
+) -> float:
+    """Returns the time, within [low, high], at which the footprint has moved so far [m]."""
+    speed = math.hypot(twist[0], twist[1])
+    turn_speed = abs(twist[2]) * body.farthest_corner
+    for _ in range(TIME_BISECTIONS):
+        middle = 0.5 * (low + high)
+        drive_time, turn_time = _split_time(
+            middle, twist, braked_speed, body, reaction, deceleration
+        )
+        if speed * drive_time + turn_speed * turn_time < moved:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+@kernel
+def _append_place(places: Array, s: int, arc: tuple[float, float, float]) -> None:
+    """Writes place s, which an arc reaches from the place before."""
+    x, y, cosine, sine = follow_arc(arc, 1.0)
+    before_cosine = places[s - 1, COSINE]
+    before_sine = places[s - 1, SINE]
+    places[s, X] = places[s - 1, X] + before_cosine * x - before_sine * y
+    places[s, Y] = places[s - 1, Y] + before_sine * x + before_cosine * y
+    places[s, COSINE] = before_cosine * cosine - before_sine * sine
+    places[s, SINE] = before_sine * cosine + before_cosine * sine
 
 
 @kernel
@@ -355,7 +421,9 @@ def _compute_full_speed_time(
 
 
 @kernel
-def follow_arc(twist: Array, time: float) -> tuple[float, float, float, float]:
+def follow_arc(
+    twist: Array | tuple[float, float, float], time: float
+) -> tuple[float, float, float, float]:
     """Returns x, y, cosine and sine of heading after a time on the exact arc of a twist (3,)."""
     turn = twist[2] * time
     cosine = math.cos(turn)

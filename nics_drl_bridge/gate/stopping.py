@@ -86,15 +86,11 @@ def shield_config(
     path = find_config(file, "limits") if file else None
     measured = load_yaml(path, LimitsFile).shield if path else None
     overrides = overrides or {}
-    try:
-        braking = derive_braking(model, limits)
-    except ConfigError as error:
-        if measured is None and not overrides.keys() >= {"latency", "deceleration"}:
-            advice = "The file of limits may give it: `shield: {latency: .., deceleration: ..}`."
-            raise ConfigError(f"{error} {advice}") from None
-        braking = Braking(0.0, math.inf)
-    deceleration = min(braking.deceleration, HARDEST)
-    stopping = {"latency": braking.reaction_s, "deceleration": deceleration}
+    braking = _derive_braking_unless_given(model, limits, measured, overrides)
+    stopping = {
+        "latency": braking.reaction_s,
+        "deceleration": min(braking.deceleration, HARDEST),
+    }
     if measured is not None:
         stopping = measured.model_dump()
     values = validate({**stopping, **overrides}, Stopping, "the shield's parameters")
@@ -121,6 +117,22 @@ def shield_config(
         f"{name} {value:g}" for name, value in values.model_dump().items()
     )
     return config, f"the shield is on: {listed} ({source})"
+
+
+def _derive_braking_unless_given(
+    model: SimulatorModel,
+    limits: Limits | None,
+    measured: Stopping | None,
+    overrides: Mapping[str, float],
+) -> Braking:
+    """Returns `derive_braking`, or no braking for a model without rest whose stops are given."""
+    try:
+        return derive_braking(model, limits)
+    except ConfigError as error:
+        if measured is None and not overrides.keys() >= {"latency", "deceleration"}:
+            advice = "The file of limits may give it: `shield: {latency: .., deceleration: ..}`."
+            raise ConfigError(f"{error} {advice}") from None
+        return Braking(0.0, math.inf)
 
 
 def _adapt_turn(braking: Braking, stopping: Stopping) -> TurnBraking | None:

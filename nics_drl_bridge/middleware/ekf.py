@@ -39,10 +39,10 @@ from nics_drl_bridge.middleware.belief import (
 )
 from nics_drl_bridge.middleware.kernels import (
     Clone,
-    CommandLog,
     MotionModel,
     Odometry,
     OdometryModel,
+    insert_command,
     make_log,
 )
 from nics_drl_bridge.middleware.measurement import (
@@ -186,8 +186,7 @@ class Estimator:
             rate_error_jacobian=self._start_jacobian,
             gyro=gyro,
         )
-        low, high = self._command_limits
-        self._log = make_log(np.minimum(np.maximum(command, low), high))
+        self._log = make_log(self._clip_command(command))
 
     @property
     def belief(self) -> Belief:
@@ -257,51 +256,56 @@ class Estimator:
         needed_ns -= (
             int(self._motion.terms.extra_delays.max(initial=0)) * self._motion.step_ns
         )
-        effective, commands = kernels.insert_command(
+        log = insert_command(
             self._log,
             self.compute_effect_time(stamp_ns),
-            np.asarray(command, np.float64),
-            *self._command_limits,
+            self._clip_command(command),
             needed_ns,
         )
-        if not len(effective):
+        if log is None:
             return False
-        self._log = CommandLog(effective, commands)
+        self._log = log
         return True
+
+    def _clip_command(self, command: ArrayLike) -> Array:
+        low, high = self._command_limits
+        return np.minimum(np.maximum(np.asarray(command, np.float64), low), high)
 
     def look_ahead(self, time_ns: int) -> tuple[Array, Array]:
         """Predicts pose (3,) and body twist (3,) at a time, without moving the estimate."""
-        mean, twist = kernels.look_ahead(
+        mean, (twist, _) = self._look_ahead(time_ns)
+        return mean[:3], twist
+
+    def _look_ahead(self, time_ns: int) -> tuple[Array, tuple[Array, Array]]:
+        ahead: tuple[Array, tuple[Array, Array]] = kernels.look_ahead(
             self._filter.x, self.time_ns, time_ns, self._motion, self._log
         )
-        return mean[:3], twist
+        return ahead
 
     def predict(self, time_ns: int) -> None:
         """Moves the estimate forward to a time; an earlier time changes nothing."""
         passed_ns = time_ns - self.time_ns
         if passed_ns <= 0:
             return
-        mean, covariance, twist, rate_error_jacobian, mean_jacobian = (
-            kernels.predict_estimate(
-                self._filter.x,
-                self._filter.P,
-                self._process,
-                self.time_ns,
-                time_ns,
-                self._motion,
-                self._log,
-            )
+        mean, covariance, twist, transition = kernels.predict_estimate(
+            self._filter.x,
+            self._filter.P,
+            self._process,
+            self.time_ns,
+            time_ns,
+            self._motion,
+            self._log,
         )
         if passed_ns > self._motion.longest_ns:
             covariance = self.unobserved.widen(covariance, passed_ns / NS_PER_S)
             self._lost = True
         if self._clone is not None:
-            cross = mean_jacobian @ self._clone.cross
+            cross = transition[:, : len(mean)] @ self._clone.cross
             self._clone = self._clone._replace(cross=cross)
         self.time_ns = time_ns
         self._filter.x = mean
         self._filter.P = covariance
-        self._rate_error_jacobian = rate_error_jacobian
+        self._rate_error_jacobian = transition[:, len(mean) :]
         self._twist = twist
 
     def take_yaw_rate(self, time_ns: int, measurement: Measurement) -> Judgement:
@@ -515,10 +519,7 @@ class Estimator:
             return self._filter.x[:3], self._pose_jacobian
         if self._twist is not None:
             return self._twist
-        twist, jacobian = kernels.predict_twist(
-            self._filter.x, self.time_ns, self._motion, self._log
-        )
-        return twist, jacobian
+        return self._look_ahead(self.time_ns)[1]
 
     def _record_innovation(self, kind: Kind, innovation: Array) -> bool:
         """Records an innovation; returns True if it opposes the last one, which suggests noise."""

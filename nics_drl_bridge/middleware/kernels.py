@@ -4,10 +4,13 @@ Shared arguments: `mean` is (3 + S,), `covariance` (3 + S, 3 + S); `begin`, `end
 times [ns]; `motion` is the `MotionModel`, `log` the `CommandLog`. A `transition` (3 + S, 3 + 2 S)
 is the Jacobian of a predicted mean with respect to the mean before and to a constant error in the
 state's S rates. See `ekf` for how the parts work together.
+
+Matrices are multiplied by loops, because numba compiles them far faster than `@`, slices of arrays
+and `np.linalg`.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +25,7 @@ MAX_ARC_S = 0.25
 # Lower bound on a variable's variance given the preceding ones, as a fraction of its variance
 MIN_PIVOT = 1e-12
 MIN_VARIANCE = 1e-18  # absolute lower bound on that variance
+NEVER_NS = 2**63 - 1
 
 
 class Odometry(NamedTuple):
@@ -79,10 +83,109 @@ def make_log(command: ArrayLike) -> CommandLog:
     return CommandLog(times, np.array([command], np.float64))
 
 
+def insert_command(
+    log: CommandLog, effective_ns: int, command: Array, needed_ns: int
+) -> CommandLog | None:
+    """Returns a log with one more command (C,), without those that ended before `needed_ns`.
+
+    Returns None if a command already takes effect at the same time.
+    """
+    place, needed = np.searchsorted(log.effective, (effective_ns, needed_ns)).tolist()
+    if effective_ns in log.effective[place : place + 1]:
+        return None
+    first = min(place, max(needed - 1, 0))
+    times = np.insert(log.effective[first:], place - first, effective_ns)
+    commands = np.insert(log.commands[first:], place - first, command, axis=0)
+    return CommandLog(times, commands)
+
+
 @kernel(allocates=True)
+def multiply(left: Array, right: Array) -> Array:
+    """Returns the product (m, n) of two matrices, (m, k) and (k, n)."""
+    product = np.zeros((left.shape[0], right.shape[1]))
+    for i in range(product.shape[0]):
+        for j in range(product.shape[1]):
+            for k in range(left.shape[1]):
+                product[i, j] += left[i, k] * right[k, j]
+    return product
+
+
+@kernel(allocates=True)
+def transpose(matrix: Array) -> Array:
+    """Returns the transpose (n, m) of a matrix (m, n)."""
+    transposed = np.empty((matrix.shape[1], matrix.shape[0]))
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            transposed[j, i] = matrix[i, j]
+    return transposed
+
+
+@kernel
+def add_to(total: Array, part: Array, factor: float) -> None:
+    """Adds a matrix (m, n) times a factor to the upper left of another one in place."""
+    for i in range(part.shape[0]):
+        for j in range(part.shape[1]):
+            total[i, j] += factor * part[i, j]
+
+
+@kernel(allocates=True)
+def project(covariance: Array, jacobian: Array, noise: Array) -> Array:
+    """Returns jacobian (n, m) @ covariance (m, m) @ jacobian.T + noise (n, n)."""
+    projected: Array = multiply(multiply(jacobian, covariance), transpose(jacobian))
+    add_to(projected, noise, 1.0)
+    return projected
+
+
+@kernel(allocates=True)
+def compute_gain(shared: Array, spread: Array) -> Array:
+    """Returns the Kalman gain (m, n), shared @ inverse(spread), by Gaussian elimination.
+
+    `shared` (m, n) is the covariance of m variables with an innovation, `spread` (n, n) that of the
+    innovation.
+    """
+    gain = shared.copy()
+    rest = spread.copy()
+    size = spread.shape[0]
+    for i in range(size):
+        for j in range(i + 1, size):
+            factor = rest[j, i] / rest[i, i]
+            for k in range(i, size):
+                rest[j, k] -= factor * rest[i, k]
+            for row in range(gain.shape[0]):
+                gain[row, j] -= factor * gain[row, i]
+    for row in range(gain.shape[0]):
+        for i in range(size - 1, -1, -1):
+            for k in range(i + 1, size):
+                gain[row, i] -= rest[i, k] * gain[row, k]
+            gain[row, i] /= rest[i, i]
+    return gain
+
+
+@kernel
+def correct_mean(mean: Array, gain: Array, innovation: Array) -> None:
+    """Adds gain (m, n) @ innovation (n,) to the first m variables of a mean in place."""
+    for i in range(gain.shape[0]):
+        for k in range(gain.shape[1]):
+            mean[i] += gain[i, k] * innovation[k]
+
+
+@kernel(allocates=True)
+def measure_nis(innovation: Array, spread: Array) -> float:
+    """Returns the normalised innovation squared of an innovation (n,) with covariance (n, n)."""
+    row = np.empty((1, innovation.shape[0]))
+    for k in range(innovation.shape[0]):
+        row[0, k] = innovation[k]
+    gain = compute_gain(row, spread)
+    nis = 0.0
+    for k in range(innovation.shape[0]):
+        nis += gain[0, k] * innovation[k]
+    return nis
+
+
+@kernel
 def compute_rates_jacobian(jacobian: Array, x: Array, terms: robot.Terms) -> None:
     """Writes the Jacobian (3 + S, S + C) of `robot.kernels.rates` by state and command."""
-    jacobian[:] = 0.0
+    jacobian.fill(0.0)
     for k in range(terms.dof.shape[0]):
         for position in range(terms.degree[k]):
             product = terms.coefficient[k]
@@ -100,6 +203,44 @@ def compute_drag_slope(value: float, dt: float, drag: float) -> float:
     return 1.0 / (1.0 + dt * drag * abs(value)) ** 2
 
 
+@kernel
+def write_step_jacobian(
+    step: Array,
+    mean: Array,
+    dq: Array,
+    jacobian: Array,
+    dt: float,
+    terms: robot.Terms,
+) -> None:
+    """Writes the Jacobian (3 + S, 3 + S) of the mean after `dt` [s] by the mean before.
+
+    The rates are `dq` (3 + S,) with the `jacobian` of `compute_rates_jacobian`.
+    """
+    # The arc is short, so the derivative at its middle heading is good to second order.
+    middle = mean[2] + dq[2] * dt / 2.0
+    c = math.cos(middle)
+    s = math.sin(middle)
+    step.fill(0.0)
+    for i in range(3):
+        step[i, i] = 1.0
+    step[0, 2] = -dt * (s * dq[0] + c * dq[1])
+    step[1, 2] = dt * (c * dq[0] - s * dq[1])
+    for i in range(mean.shape[0] - 3):
+        turn = dt / 2.0 * jacobian[2, i]
+        ahead = c * jacobian[0, i] - s * jacobian[1, i]
+        aside = s * jacobian[0, i] + c * jacobian[1, i]
+        step[0, 3 + i] = dt * ahead + step[0, 2] * turn
+        step[1, 3 + i] = dt * aside + step[1, 2] * turn
+        step[2, 3 + i] = dt * jacobian[2, i]
+        for d in range(3, mean.shape[0]):
+            slope = 1.0 if d == 3 + i else 0.0
+            # A limited rate does not depend on the state.
+            if terms.fall[d - 3] <= dq[d] <= terms.rise[d - 3]:
+                slope += dt * jacobian[d, i]
+            free = mean[d] + dt * dq[d]
+            step[d, 3 + i] = slope * compute_drag_slope(free, dt, terms.drag[d - 3])
+
+
 @kernel(allocates=True)
 def step_mean(
     mean: Array,
@@ -110,93 +251,45 @@ def step_mean(
     motion: MotionModel,
 ) -> None:
     """Moves a mean and its transition in place by `steps` of `dt` [s] under a command (C,)."""
-    size = mean.shape[0] - 3
-    width = command.shape[0]
-    x = np.ones(size + width + 1)
-    dq = np.zeros(3 + size)
-    jacobian = np.zeros((3 + size, size + width))
-    step = np.eye(3 + size)
+    width = mean.shape[0]
+    size = width - 3
+    x = np.ones(size + command.shape[0] + 1)
+    dq = np.zeros(width)
+    jacobian = np.zeros((width, size + command.shape[0]))
+    step = np.zeros((width, width))
     robot.put_command(x, command, motion.terms)
     for _ in range(steps):
-        x[:size] = mean[3:]
+        for i in range(size):
+            x[i] = mean[3 + i]
         robot.rates(dq, x, motion.terms)
         compute_rates_jacobian(jacobian, x, motion.terms)
-        # The arc is short, so the derivative at its middle heading is good to second order.
-        middle = mean[2] + dq[2] * dt / 2.0
-        c = math.cos(middle)
-        s = math.sin(middle)
-        step[:] = np.eye(3 + size)
-        step[0, 2] = -dt * (s * dq[0] + c * dq[1])
-        step[1, 2] = dt * (c * dq[0] - s * dq[1])
+        write_step_jacobian(step, mean, dq, jacobian, dt, motion.terms)
+        moved = multiply(step, transition)
         for i in range(size):
-            turn = dt / 2.0 * jacobian[2, i]
-            step[0, 3 + i] = (
-                dt * (c * jacobian[0, i] - s * jacobian[1, i]) + step[0, 2] * turn
-            )
-            step[1, 3 + i] = (
-                dt * (s * jacobian[0, i] + c * jacobian[1, i]) + step[1, 2] * turn
-            )
-            step[2, 3 + i] = dt * jacobian[2, i]
-            for d in range(size):
-                slope = 1.0 if d == i else 0.0
-                # A limited rate does not depend on the state.
-                if motion.terms.fall[d] <= dq[3 + d] <= motion.terms.rise[d]:
-                    slope += dt * jacobian[3 + d, i]
-                free = mean[3 + d] + dt * dq[3 + d]
-                drag_slope = compute_drag_slope(free, dt, motion.terms.drag[d])
-                step[3 + d, 3 + i] = drag_slope * slope
-        transition[:] = step @ transition
-        for i in range(size):
-            transition[3 + i, 3 + size + i] += dt
-        robot.advance(mean[:3], dq, dt, motion.series)
+            moved[3 + i, width + i] += dt
+        transition.fill(0.0)
+        add_to(transition, moved, 1.0)
+        robot.advance(mean, dq, dt, motion.series)
         for i in range(size):
             bounds = robot.get_bounds(motion.terms, i)
             mean[3 + i] = robot.advance_state(mean[3 + i], dq[3 + i], dt, bounds)
 
 
-@kernel(allocates=True)
+@kernel
 def find_command(log: CommandLog, time: int) -> int:
     """Returns the index of the last command that took effect before a time; 0 if there is none."""
-    following = int(np.searchsorted(log.effective, time))
-    return max(following - 1, 0)
+    index: int = log.effective.shape[0] - 1
+    while index > 0 and log.effective[index] >= time:
+        index -= 1
+    return index
 
 
-@kernel(allocates=True)
-def insert_command(
-    log: CommandLog,
-    effective_ns: int,
-    command: Array,
-    low: Array,
-    high: Array,
-    needed_ns: int,
-) -> tuple[NDArray[np.int64], Array]:
-    """Returns the fields of a log with one more command (C,), clipped to [low, high].
-
-    Commands that ended before `needed_ns` are dropped. The result is empty for a duplicate time.
-    """
-    count = log.effective.shape[0]
-    place = int(np.searchsorted(log.effective, effective_ns))
-    if place < count and log.effective[place] == effective_ns:
-        return np.empty(0, np.int64), np.empty((0, command.shape[0]))
-    first = min(place, find_command(log, needed_ns))
-    times = np.empty(count - first + 1, np.int64)
-    values = np.empty((count - first + 1, command.shape[0]))
-    middle = place - first
-    times[:middle] = log.effective[first:place]
-    times[middle] = effective_ns
-    times[middle + 1 :] = log.effective[place:]
-    values[:middle] = log.commands[first:place]
-    values[middle] = np.minimum(np.maximum(command, low), high)
-    values[middle + 1 :] = log.commands[place:]
-    return times, values
-
-
-@kernel(allocates=True)
+@kernel
 def read_commands(
     command: Array, time: int, motion: MotionModel, log: CommandLog
 ) -> int:
     """Writes the commands (C,) in effect just before a time; returns when they change next [ns]."""
-    following = np.iinfo(np.int64).max
+    following = NEVER_NS
     for c in range(command.shape[0]):
         delay = motion.terms.extra_delays[c] * motion.step_ns
         k = find_command(log, time - delay)
@@ -209,12 +302,32 @@ def read_commands(
 @kernel(allocates=True)
 def make_transition(width: int, time: float) -> Array:
     """Returns the transition (3 + S, 3 + 2 S) over a time [s] in which the robot did not move."""
-    size = width - 3
-    transition = np.zeros((width, width + size))
-    transition[:, :width] = np.eye(width)
-    for i in range(size):
-        transition[3 + i, width + i] = time
+    transition = np.zeros((width, 2 * width - 3))
+    write_standstill(transition, time)
     return transition
+
+
+@kernel
+def write_standstill(transition: Array, time: float) -> None:
+    """Writes the transition over a time [s] in which the robot did not move."""
+    width = transition.shape[0]
+    transition.fill(0.0)
+    for i in range(width):
+        transition[i, i] = 1.0
+    for i in range(3, width):
+        transition[i, width + i - 3] = time
+
+
+@kernel
+def has_diverged(mean: Array, transition: Array) -> bool:
+    """True if a mean or its transition is NaN or beyond `DIVERGED`."""
+    for i in range(mean.shape[0]):
+        if not abs(mean[i]) < DIVERGED:
+            return True
+        for k in range(transition.shape[1]):
+            if not abs(transition[i, k]) < DIVERGED:
+                return True
+    return False
 
 
 @kernel(allocates=True)
@@ -230,27 +343,25 @@ def propagate_mean(
 
     After a gap that is too long, or if the model diverges, the pose is kept and the state is zero.
     """
-    step = motion.step_ns
-    if end - begin > motion.longest_ns:
-        mean[3:] = 0.0
-        transition[:] = make_transition(mean.shape[0], (end - begin) / NS_PER_S)
-        return
-    start_pose = mean[:3].copy()
-    command = np.empty(log.commands.shape[1])
-    now = begin
-    while now < end:
-        # "just before" the next nanosecond: also a command that takes effect now
-        until = min(read_commands(command, now + 1, motion, log), end)
-        steps = (until - now) // step
-        rest = (until - now) % step
-        step_mean(mean, transition, command, step / NS_PER_S, steps, motion)
-        if rest > 0:
-            step_mean(mean, transition, command, rest / NS_PER_S, 1, motion)
-        now = until
-    if not (np.all(np.abs(mean) < DIVERGED) and np.all(np.abs(transition) < DIVERGED)):
-        mean[:3] = start_pose
-        mean[3:] = 0.0
-        transition[:] = make_transition(mean.shape[0], (end - begin) / NS_PER_S)
+    start = mean.copy()
+    is_predictable = end - begin <= motion.longest_ns
+    if is_predictable:
+        command = np.empty(log.commands.shape[1])
+        now = begin
+        while now < end:
+            # "just before" the next nanosecond: also a command that takes effect now
+            until = min(read_commands(command, now + 1, motion, log), end)
+            steps = (until - now) // motion.step_ns
+            rest = (until - now) % motion.step_ns
+            step_s = motion.step_ns / NS_PER_S
+            step_mean(mean, transition, command, step_s, steps, motion)
+            if rest > 0:
+                step_mean(mean, transition, command, rest / NS_PER_S, 1, motion)
+            now = until
+    if not is_predictable or has_diverged(mean, transition):
+        for i in range(mean.shape[0]):
+            mean[i] = start[i] if i < 3 else 0.0
+        write_standstill(transition, (end - begin) / NS_PER_S)
 
 
 @kernel(allocates=True)
@@ -261,17 +372,21 @@ def predict_twist(
     command = np.empty(log.commands.shape[1])
     read_commands(command, now, motion, log)
     size = mean.shape[0] - 3
-    width = command.shape[0]
-    x = np.ones(size + width + 1)
-    dq = np.zeros(3 + size)
-    rates_jacobian = np.zeros((3 + size, size + width))
-    jacobian = np.zeros((3, 3 + size))
-    x[:size] = mean[3:]
+    x = np.ones(size + command.shape[0] + 1)
+    for i in range(size):
+        x[i] = mean[3 + i]
     robot.put_command(x, command, motion.terms)
+    dq = np.zeros(3 + size)
+    rates_jacobian = np.zeros((3 + size, size + command.shape[0]))
     robot.rates(dq, x, motion.terms)
     compute_rates_jacobian(rates_jacobian, x, motion.terms)
-    jacobian[:, 3:] = rates_jacobian[:3, :size]
-    return dq[:3].copy(), jacobian
+    twist = np.empty(3)
+    jacobian = np.zeros((3, 3 + size))
+    for d in range(3):
+        twist[d] = dq[d]
+        for i in range(size):
+            jacobian[d, 3 + i] = rates_jacobian[d, i]
+    return twist, jacobian
 
 
 @kernel(allocates=True)
@@ -283,11 +398,10 @@ def predict_estimate(
     end: int,
     motion: MotionModel,
     log: CommandLog,
-) -> tuple[Array, Array, tuple[Array, Array], Array, Array]:
+) -> tuple[Array, Array, tuple[Array, Array], Array]:
     """Predicts an estimate from `begin` to `end`; `process` (3 + S, 3 + S) is its noise per second.
 
-    Returns mean, covariance, the result of `predict_twist`, and the Jacobians of the mean with
-    respect to an error in the state's rates (3 + S, S) and to the mean before (3 + S, 3 + S).
+    Returns mean, covariance, the result of `predict_twist`, and the transition.
     """
     # A wrong model stays wrong for a while, so the error in the state's rates is taken as constant.
     # It then moves the pose too, and a correction of the state also corrects the pose.
@@ -297,28 +411,41 @@ def predict_estimate(
     time = (end - begin) / NS_PER_S
     transition = make_transition(width, 0.0)
     propagate_mean(moved, transition, begin, end, motion, log)
-    by_mean = transition[:, :width].copy()
-    by_rates = transition[:, width:].copy()
-    predicted = (
-        by_mean @ covariance @ by_mean.T
-        + by_rates @ (process[3:, 3:] / time) @ by_rates.T
-    )
-    predicted[:3, :3] += process[:3, :3] * time
-    predicted = (predicted + predicted.T) * 0.5
+    joint = np.zeros((transition.shape[1], transition.shape[1]))
+    add_to(joint, covariance, 1.0)
+    pose_noise = np.zeros((width, width))
+    for i in range(width):
+        for k in range(width):
+            if i < 3 and k < 3:
+                pose_noise[i, k] = process[i, k] * time
+            elif i >= 3 and k >= 3:
+                joint[width + i - 3, width + k - 3] = process[i, k] / time
+    predicted = project(joint, transition, pose_noise)
+    make_symmetric(predicted)
     twist = predict_twist(moved, end, motion, log)
-    return moved, predicted, twist, by_rates, by_mean
+    return moved, predicted, twist, transition
+
+
+@kernel
+def make_symmetric(matrix: Array) -> None:
+    """Replaces a matrix (n, n) by the mean of itself and its transpose, in place."""
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            entry = 0.5 * (matrix[i, j] + matrix[j, i])
+            matrix[i, j] = entry
+            matrix[j, i] = entry
 
 
 @kernel(allocates=True)
 def look_ahead(
     mean: Array, begin: int, end: int, motion: MotionModel, log: CommandLog
-) -> tuple[Array, Array]:
-    """Predicts mean and body twist (3,) at `end`; returns the current ones if that is earlier."""
+) -> tuple[Array, tuple[Array, Array]]:
+    """Predicts mean and `predict_twist` at `end`; returns the current ones if that is earlier."""
     moved = mean.copy()
     if end > begin:
         transition = make_transition(mean.shape[0], 0.0)
         propagate_mean(moved, transition, begin, end, motion, log)
-    return moved, predict_twist(moved, max(begin, end), motion, log)[0]
+    return moved, predict_twist(moved, max(begin, end), motion, log)
 
 
 @kernel(allocates=True)
@@ -326,19 +453,22 @@ def compute_nis(
     innovation: Array, jacobian: Array, covariance: Array, noise: Array
 ) -> float:
     """Returns the normalised innovation squared: chi-squared if the filter is consistent."""
-    spread = jacobian @ covariance @ jacobian.T + noise
-    return float(innovation @ np.linalg.solve(spread, innovation))
+    return float(measure_nis(innovation, project(covariance, jacobian, noise)))
 
 
 @kernel(allocates=True)
 def compute_update(
     covariance: Array, jacobian: Array, noise: Array
-) -> tuple[NDArray[np.floating[Any]], Array]:
+) -> tuple[Array, Array]:
     """Returns the Kalman gain (3 + S, n) and the updated covariance, computed as in filterpy."""
-    shared: Array = covariance @ jacobian.T
-    gain = np.linalg.solve(jacobian @ shared + noise, shared.T).T.copy()
-    left = np.eye(covariance.shape[0]) - gain @ jacobian
-    return gain, left @ covariance @ left.T + gain @ noise @ gain.T
+    shared = multiply(covariance, transpose(jacobian))
+    gain = compute_gain(shared, project(covariance, jacobian, noise))
+    left = multiply(gain, jacobian)
+    for i in range(left.shape[0]):
+        for k in range(left.shape[1]):
+            left[i, k] = (1.0 if i == k else 0.0) - left[i, k]
+    added = project(noise, gain, np.zeros(covariance.shape))
+    return gain, project(covariance, left, added)
 
 
 @kernel(allocates=True)
@@ -349,13 +479,15 @@ def correct_clone(
 
     The measurement has innovation (n,), Jacobian (n, 3 + S) and noise (n, n).
     """
-    seen = jacobian @ clone.cross
-    gain = np.linalg.solve(jacobian @ covariance @ jacobian.T + noise, seen)
-    cross = clone.cross - covariance @ (jacobian.T @ gain)
+    seen = transpose(multiply(jacobian, clone.cross))
+    gain = compute_gain(seen, project(covariance, jacobian, noise))
+    by_state = multiply(covariance, transpose(jacobian))
+    cross = clone.cross.copy()
+    add_to(cross, multiply(by_state, transpose(gain)), -1.0)
     mean = clone.mean.copy()
-    mean[:3] += innovation @ gain.copy()
+    correct_mean(mean, gain, innovation)
     corrected = clone.covariance.copy()
-    corrected[:3, :3] -= seen.T @ gain
+    add_to(corrected, multiply(gain, transpose(seen)), -1.0)
     return Clone(clone.odometry, mean, corrected, cross, True)
 
 
@@ -387,12 +519,19 @@ def agrees_with_twists(
     ahead = relative[0]
     left = relative[1]
     turn = relative[2]
-    arc = np.array([ahead + 0.5 * turn * left, left - 0.5 * turn * ahead, turn])
-    residual = arc - 0.5 * seconds * (odometry.twist + clone.odometry.twist)
-    spread = model.random_walk * seconds + 0.25 * slack
+    residual = np.empty(3)
+    residual[0] = ahead + 0.5 * turn * left
+    residual[1] = left - 0.5 * turn * ahead
+    residual[2] = turn
+    spread = np.zeros((3, 3))
+    add_to(spread, model.random_walk, seconds)
+    add_to(spread, slack, 0.25)
+    for d in range(3):
+        residual[d] -= 0.5 * seconds * (odometry.twist[d] + clone.odometry.twist[d])
     # It is unknown where along the path the robot turned.
-    spread += np.diag((0.25 * turn * np.array([left, ahead, 0.0])) ** 2)
-    return bool(residual @ np.linalg.solve(spread, residual) <= model.gate)
+    spread[0, 0] += (0.25 * turn * left) ** 2
+    spread[1, 1] += (0.25 * turn * ahead) ** 2
+    return bool(measure_nis(residual, spread) <= model.gate)
 
 
 @kernel(allocates=True)
@@ -414,15 +553,89 @@ def replace_pose(
     moved[0] = start[0] + c * relative[0] - s * relative[1]
     moved[1] = start[1] + s * relative[0] + c * relative[1]
     moved[2] = start[2] + relative[2]
-    jacobian = np.eye(3)
+    jacobian = np.zeros((3, mean.shape[0]))
+    for d in range(3):
+        jacobian[d, d] = 1.0
     jacobian[0, 2] = start[1] - moved[1]
     jacobian[1, 2] = moved[0] - start[0]
-    start_covariance = clone.covariance[:3, :3].copy()
+    pose_covariance = project(clone.covariance, jacobian, random_walk)
     replaced = covariance.copy()
-    replaced[:3, 3:] = 0.0
-    replaced[3:, :3] = 0.0
-    replaced[:3, :3] = jacobian @ start_covariance @ jacobian.T + random_walk
+    for d in range(3):
+        for i in range(3, mean.shape[0]):
+            replaced[d, i] = 0.0
+            replaced[i, d] = 0.0
+        for k in range(3):
+            replaced[d, k] = pose_covariance[d, k]
     return moved, replaced
+
+
+@kernel(allocates=True)
+def compare_relative_pose(
+    mean: Array, clone: Clone, odometry: Odometry
+) -> tuple[Array, Array]:
+    """Returns odometry's pose relative to the clone's (3,), and its innovation (3,)."""
+    start = clone.odometry.pose
+    relative = np.empty(3)
+    relative[0], relative[1] = compute_displacement(start, odometry.pose)
+    relative[2] = robot.wrap(odometry.pose[2] - start[2])
+    ahead, left = compute_displacement(clone.mean, mean)
+    innovation = np.empty(3)
+    innovation[0] = relative[0] - ahead
+    innovation[1] = relative[1] - left
+    innovation[2] = robot.wrap(relative[2] - mean[2] + clone.mean[2])
+    return relative, innovation
+
+
+@kernel(allocates=True)
+def join_clone(mean: Array, covariance: Array, clone: Clone) -> tuple[Array, Array]:
+    """Returns the covariance (6 + S, 6 + S) of state and cloned pose, and a Jacobian (3, 6 + S).
+
+    The Jacobian is that of the current pose in the frame of the cloned one.
+    """
+    width = mean.shape[0]
+    joint = np.zeros((width + 3, width + 3))
+    add_to(joint, covariance, 1.0)
+    for k in range(3):
+        for i in range(width):
+            joint[i, width + k] = clone.cross[i, k]
+            joint[width + k, i] = clone.cross[i, k]
+        for i in range(3):
+            joint[width + i, width + k] = clone.covariance[i, k]
+    c = math.cos(clone.mean[2])
+    s = math.sin(clone.mean[2])
+    ahead, left = compute_displacement(clone.mean, mean)
+    jacobian = np.zeros((3, width + 3))
+    jacobian[0, 0] = c
+    jacobian[0, 1] = s
+    jacobian[1, 0] = -s
+    jacobian[1, 1] = c
+    jacobian[2, 2] = 1.0
+    for d in range(3):
+        for k in range(3):
+            jacobian[d, width + k] = -jacobian[d, k]
+    jacobian[0, width + 2] = left
+    jacobian[1, width + 2] = -ahead
+    return joint, jacobian
+
+
+@kernel(allocates=True)
+def update_with_clone(
+    mean: Array,
+    covariance: Array,
+    joint: Array,
+    jacobian: Array,
+    innovation: Array,
+    noise: Array,
+) -> tuple[Array, Array]:
+    """Returns an estimate after the usual update by a relative pose, with `join_clone`'s result."""
+    shared = multiply(joint, transpose(jacobian))[: mean.shape[0]]
+    gain = compute_gain(shared, project(joint, jacobian, noise))
+    moved = mean.copy()
+    correct_mean(moved, gain, innovation)
+    corrected = covariance.copy()
+    add_to(corrected, multiply(gain, transpose(shared)), -1.0)
+    make_symmetric(corrected)
+    return moved, corrected
 
 
 @kernel(allocates=True)
@@ -439,46 +652,26 @@ def correct_by_relative_pose(
     prediction is wrong, and the relative pose replaces it.
     """
     seconds = (odometry.time_ns - clone.odometry.time_ns) / NS_PER_S
-    start = clone.odometry.pose
-    ahead, left = compute_displacement(start, odometry.pose)
-    turn = robot.wrap(odometry.pose[2] - start[2])
-    relative = np.array([ahead, left, turn])
-    expected_ahead, expected_left = compute_displacement(clone.mean, mean)
-    innovation = np.array(
-        [
-            ahead - expected_ahead,
-            left - expected_left,
-            robot.wrap(turn - mean[2] + clone.mean[2]),
-        ]
-    )
-    c = math.cos(clone.mean[2])
-    s = math.sin(clone.mean[2])
-    jacobian = np.zeros((3, mean.shape[0]))
-    jacobian[0, 0] = c
-    jacobian[0, 1] = s
-    jacobian[1, 0] = -s
-    jacobian[1, 1] = c
-    jacobian[2, 2] = 1.0
-    clone_jacobian = np.array(
-        [[-c, -s, expected_left], [s, -c, -expected_ahead], [0.0, 0.0, -1.0]]
-    )
-    clone_covariance = clone.covariance[:3, :3].copy()
-    shared = covariance @ jacobian.T + clone.cross @ clone_jacobian.T
-    clone_shared = clone.cross.T @ jacobian.T + clone_covariance @ clone_jacobian.T
-    random_walk = model.random_walk * seconds
-    spread = jacobian @ shared + clone_jacobian @ clone_shared + random_walk
+    relative, innovation = compare_relative_pose(mean, clone, odometry)
+    joint, jacobian = join_clone(mean, covariance, clone)
+    noise = np.zeros((3, 3))
+    add_to(noise, model.random_walk, seconds)
     # Between two odometries the robot may have had either twist.
-    slack = np.diag((0.5 * seconds * (odometry.twist - clone.odometry.twist)) ** 2)
-    if innovation @ np.linalg.solve(spread + slack, innovation) <= model.gate:
-        gain = np.linalg.solve(spread, shared.T)
-        moved = mean + innovation @ gain
-        corrected = covariance - shared @ gain
-        corrected = (corrected + corrected.T) * 0.5
+    slack = np.zeros((3, 3))
+    for d in range(3):
+        change = odometry.twist[d] - clone.odometry.twist[d]
+        slack[d, d] = (0.5 * seconds * change) ** 2
+    spread = project(joint, jacobian, noise)
+    add_to(spread, slack, 1.0)
+    if measure_nis(innovation, spread) <= model.gate:
+        moved, corrected = update_with_clone(
+            mean, covariance, joint, jacobian, innovation, noise
+        )
     elif agrees_with_twists(relative, slack, clone, odometry, model):
-        moved, corrected = replace_pose(mean, covariance, clone, relative, random_walk)
+        moved, corrected = replace_pose(mean, covariance, clone, relative, noise)
     else:
         return mean, covariance
-    corrected[:3, :3] += model.slip * seconds
+    add_to(corrected, model.slip, seconds)
     repair_estimate(moved, corrected, model.state_low, model.state_high)
     return moved, corrected
 
@@ -501,7 +694,8 @@ def correct_by_odometry(
     """
     corrected_clone = correct_clone(clone, innovation, jacobian, covariance, noise)
     gain, corrected = compute_update(covariance, jacobian, noise)
-    moved = mean + gain @ innovation
+    moved = mean.copy()
+    correct_mean(moved, gain, innovation)
     repair_estimate(moved, corrected, model.state_low, model.state_high)
     estimate: tuple[Array, Array] = correct_by_relative_pose(
         moved, corrected, corrected_clone, odometry, model

@@ -265,43 +265,32 @@ def fuse_odometry(
         wheels_rate=float(twist[2]),
     )
     seconds = (now_ns - gyro.odom_ns) / NS_PER_S
-    if not _covers_odometry(gyro, now_ns) or seconds <= 0.0:
-        moved = geometry.compose(before, geometry.exp(step))
-        return FusedOdometry(moved, twist, updated)
-    by_gyro = updated.odom_integral - gyro.odom_integral
-    by_wheels = float(step[2])
-    wheels_stand = bool((step == 0.0).all() and (twist == 0.0).all())
-    unbiased = by_gyro - gyro.bias * seconds
-    updated = _compare_turns(updated, unbiased, by_wheels, seconds)
-    noise = gyro.variance * max(gyro.period_s, 1e-3) * seconds
-    gyro_variance = noise + gyro.bias_variance * seconds**2
-    contradicts = not wheels_stand and updated.has_contradiction(
-        unbiased, by_wheels, gyro_variance
+    by_wheels_alone = FusedOdometry(
+        geometry.compose(before, geometry.exp(step)), twist, updated
     )
-    if updated.repeats < FROZEN_COUNT:
-        updated = updated._replace(wheels_rate_before=updated.wheels_rate)
-    wheels_change = abs(updated.wheels_rate - updated.wheels_rate_before)
-    if contradicts or wheels_change > FROZEN_CHANGE or not updated.is_plausible:
-        moved = geometry.compose(before, geometry.exp(step))
-        return FusedOdometry(moved, twist, updated)
+    if not _covers_odometry(gyro, now_ns) or seconds <= 0.0:
+        return by_wheels_alone
+    turns = _Turns(
+        by_gyro=updated.odom_integral - gyro.odom_integral,
+        by_wheels=float(step[2]),
+        seconds=seconds,
+        noise=gyro.variance * max(gyro.period_s, 1e-3) * seconds,
+        wheels_stand=bool((step == 0.0).all() and (twist == 0.0).all()),
+    )
+    updated = _compare_turns(updated, turns, gyro.bias)
+    if _is_faulty(updated, turns, gyro):
+        return by_wheels_alone._replace(gyro=updated)
     # The wheels may err less than stated; their scatter relative to the gyro shows how much.
     if updated.compared_s > MIN_COMPARED_S:
         rate_variance = min(rate_variance, updated.scatter)
-    wheels_variance = rate_variance * seconds**2 + (updated.slip * by_wheels) ** 2
-    if wheels_stand or is_at_rest:
-        updated = _learn_bias_at_rest(updated, by_gyro, seconds, noise, wheels_stand)
+    wheels_variance = rate_variance * seconds**2 + (updated.slip * turns.by_wheels) ** 2
+    if turns.wheels_stand or is_at_rest:
+        updated = _learn_bias_at_rest(updated, turns)
     else:
-        difference = by_gyro - by_wheels
-        updated = _learn_bias(updated, difference, seconds, noise, wheels_variance)
-    unbiased = by_gyro - updated.bias * seconds
-    gyro_variance = noise + updated.bias_variance * seconds**2
-    # A difference beyond the gyro's known noise and bias is slip.
-    slip_variance = (unbiased - by_wheels) ** 2 - gyro_variance
-    wheels_variance = max(wheels_variance, slip_variance)
-    weight = wheels_variance / (wheels_variance + gyro_variance)
-    if wheels_stand and abs(unbiased) <= SIGMAS * math.sqrt(gyro_variance):
-        weight = 0.0  # wheels at rest do not turn the robot
-    step[2] = weight * unbiased + (1.0 - weight) * by_wheels
+        updated = _learn_bias(updated, turns, wheels_variance)
+    weight = _weigh_gyro(updated, turns, wheels_variance)
+    unbiased = turns.by_gyro - updated.bias * seconds
+    step[2] = weight * unbiased + (1.0 - weight) * turns.by_wheels
     fused_twist = np.array(twist)
     fused_twist[2] = weight * (gyro.rate - updated.bias) + (1.0 - weight) * twist[2]
     return FusedOdometry(
@@ -315,6 +304,40 @@ def fuse_odometry(
     )
 
 
+class _Turns(NamedTuple):
+    """Turns from one odometry to the next."""
+
+    by_gyro: float  # integral of the yaw rates, with their bias [rad]
+    by_wheels: float  # [rad]
+    seconds: float
+    noise: float  # variance of the gyro's turn without that of its bias [rad^2]
+    wheels_stand: bool
+
+
+def _is_faulty(gyro: Gyro, turns: _Turns, before: Gyro) -> bool:
+    """Returns True if the gyro is stuck, implausible, or contradicts the wheels."""
+    wheels_change = abs(gyro.wheels_rate - gyro.wheels_rate_before)
+    if wheels_change > FROZEN_CHANGE or not gyro.is_plausible:
+        return True
+    if turns.wheels_stand:
+        return False
+    unbiased = turns.by_gyro - before.bias * turns.seconds
+    variance = turns.noise + before.bias_variance * turns.seconds**2
+    return gyro.has_contradiction(unbiased, turns.by_wheels, variance)
+
+
+def _weigh_gyro(gyro: Gyro, turns: _Turns, wheels_variance: float) -> float:
+    """Returns the weight of the gyro's turn against that of the wheels, from 0 to 1."""
+    unbiased = turns.by_gyro - gyro.bias * turns.seconds
+    gyro_variance = turns.noise + gyro.bias_variance * turns.seconds**2
+    if turns.wheels_stand and abs(unbiased) <= SIGMAS * math.sqrt(gyro_variance):
+        return 0.0  # wheels at rest do not turn the robot
+    # A difference beyond the gyro's known noise and bias is slip.
+    slip_variance = (unbiased - turns.by_wheels) ** 2 - gyro_variance
+    wheels_variance = max(wheels_variance, slip_variance)
+    return wheels_variance / (wheels_variance + gyro_variance)
+
+
 def _covers_odometry(gyro: Gyro, now_ns: int) -> bool:
     """Returns True if yaw rates cover the time from the last odometry until now."""
     if gyro.odom is None or gyro.since_ns > gyro.odom_ns:
@@ -322,49 +345,49 @@ def _covers_odometry(gyro: Gyro, now_ns: int) -> bool:
     return 0 <= now_ns - gyro.stamp_ns <= MAX_GAP_NS
 
 
-def _compare_turns(
-    gyro: Gyro, by_gyro: float, by_wheels: float, seconds: float
-) -> Gyro:
-    """Updates the estimates of the wheels' slip and scatter from both turns [rad]."""
-    decay = math.exp(-seconds / MEMORY_S)
+def _compare_turns(gyro: Gyro, turns: _Turns, bias: float) -> Gyro:
+    """Updates the estimates of the wheels' slip and scatter from both turns."""
+    decay = math.exp(-turns.seconds / MEMORY_S)
+    by_wheels = turns.by_wheels
+    by_gyro = turns.by_gyro - bias * turns.seconds
     difference = by_gyro - by_wheels
-    is_turning = abs(by_wheels) > TURNING_RATE * seconds
+    is_turning = abs(by_wheels) > TURNING_RATE * turns.seconds
     weight = 1.0 - decay if gyro.compared_s > 0.0 else 1.0
     scatter = gyro.scatter
     if not is_turning:
-        scatter += weight * ((difference / seconds) ** 2 - gyro.scatter)
+        scatter += weight * ((difference / turns.seconds) ** 2 - gyro.scatter)
+    wheels_rate_before = gyro.wheels_rate_before
+    if gyro.repeats < FROZEN_COUNT:
+        wheels_rate_before = gyro.wheels_rate
     return gyro._replace(
         wheels_square=decay * gyro.wheels_square + is_turning * by_wheels**2,
         product=decay * gyro.product + by_wheels * by_gyro * is_turning,
         difference_square=decay * gyro.difference_square + is_turning * difference**2,
         wheels_turned=gyro.wheels_turned + abs(by_wheels),
         scatter=max(scatter, MIN_GYRO_STD**2),
-        compared_s=gyro.compared_s + seconds,
+        compared_s=gyro.compared_s + turns.seconds,
+        wheels_rate_before=wheels_rate_before,
     )
 
 
-def _learn_bias_at_rest(
-    gyro: Gyro, by_gyro: float, seconds: float, noise: float, wheels_stand: bool
-) -> Gyro:
-    """Corrects the bias by the gyro's turn [rad] while the robot stood still, or nearly so."""
-    rest_variance = REST_BIAS_STD**2 if wheels_stand else REST_RATE**2 / seconds
+def _learn_bias_at_rest(gyro: Gyro, turns: _Turns) -> Gyro:
+    """Corrects the bias by the gyro's turn while the robot stood still, or nearly so."""
+    seconds = turns.seconds
+    rest_variance = REST_BIAS_STD**2 if turns.wheels_stand else REST_RATE**2 / seconds
     variance = gyro.bias_variance + BIAS_WALK**2 * seconds
-    measured_variance = noise / seconds**2 + rest_variance
-    return _correct_bias(gyro, by_gyro / seconds, variance, measured_variance)
+    measured_variance = turns.noise / seconds**2 + rest_variance
+    return _correct_bias(gyro, turns.by_gyro / seconds, variance, measured_variance)
 
 
-def _learn_bias(
-    gyro: Gyro, difference: float, seconds: float, noise: float, wheels_variance: float
-) -> Gyro:
-    """Corrects the bias slightly while the wheels roll.
-
-    `difference` is the gyro's turn minus the wheels' turn [rad].
-    """
+def _learn_bias(gyro: Gyro, turns: _Turns, wheels_variance: float) -> Gyro:
+    """Corrects the bias slightly, by the difference of both turns, while the wheels roll."""
+    seconds = turns.seconds
     variance = gyro.bias_variance + BIAS_WALK**2 * seconds
     if variance < WHEELS_BIAS**2:  # unequal wheel sizes also turn a robot that fast
         return gyro._replace(bias_variance=variance)
     repeated = max(1.0, ERROR_DURATION_S / seconds)
-    measured_variance = noise / seconds**2 + repeated * wheels_variance / seconds**2
+    measured_variance = (turns.noise + repeated * wheels_variance) / seconds**2
+    difference = turns.by_gyro - turns.by_wheels
     return _correct_bias(gyro, difference / seconds, variance, measured_variance)
 
 

@@ -86,27 +86,32 @@ def make_field_reader(path: str) -> Callable[[Any], Any]:
             values = getattr(named, last)
             k = labels.index(label)
             return values[k] if k < len(values) else np.nan
-        within = message
-        for part in parts:
-            if isinstance(message, (list, tuple, np.ndarray)):
-                labels = getattr(within, NAMES, [])
-                if part.isdecimal():
-                    k = int(part)
-                elif part in labels:
-                    k = labels.index(part)
-                else:
-                    k = -1
-                if not 0 <= k < len(message):
-                    return np.nan
-                message = message[k]
-            else:
-                within = message
-                message = getattr(message, part)
-        if hasattr(message, "nanosec"):
-            return message.sec + message.nanosec * S_PER_NS
-        return message
+        return _follow_path(message, parts)
 
     return read
+
+
+def _follow_path(message: Any, parts: Sequence[str]) -> Any:
+    """Returns a part of a message by the names and numbers on the way to it; NaN if missing."""
+    within = message
+    for part in parts:
+        if isinstance(message, (list, tuple, np.ndarray)):
+            labels = getattr(within, NAMES, [])
+            if part.isdecimal():
+                k = int(part)
+            elif part in labels:
+                k = labels.index(part)
+            else:
+                k = -1
+            if not 0 <= k < len(message):
+                return np.nan
+            message = message[k]
+        else:
+            within = message
+            message = getattr(message, part)
+    if hasattr(message, "nanosec"):
+        return message.sec + message.nanosec * S_PER_NS
+    return message
 
 
 def make_message_table(place: str, messages: Sequence[Message], **other: Any) -> Table:

@@ -1,6 +1,6 @@
 """Reads the streams of a recording in any format according to its mapping."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -31,7 +31,7 @@ from nics_drl_bridge.recording.recording import (
     check_streams,
     find_implausible_pose,
 )
-from nics_drl_bridge.recording.table import Source, Table, read_numbers
+from nics_drl_bridge.recording.table import Column, Source, Table, read_numbers
 from nics_drl_bridge.recording.topic_roles import guess_source_by_names
 from nics_drl_bridge.recording.values import (
     MappedReader,
@@ -117,13 +117,9 @@ def _split_table(
     if not _is_only_table(reader, mapping, table) or table.stamps("") is not None:
         return []
     name = next(name for name in source.names if source.get_table(name) is table)
-    column = table.column(reference)
     episodes: list[tuple[str, Source]] = []
-    _, first, group = np.unique(column, return_index=True, return_inverse=True)
-    for k in np.argsort(first):
-        rows = np.flatnonzero(group == k)
+    for label, rows in _group_rows(table.column(reference)):
         if len(rows) >= MIN_EPISODE_ROWS:
-            label = _format_label(column[rows[0]])
             place = f"{source.place} (episode {label})"
             episodes.append((label, _Episode(place, name, table, rows)))
     if not episodes:
@@ -132,6 +128,13 @@ def _split_table(
             f"{MIN_EPISODE_ROWS} rows; name the column that numbers the episodes."
         )
     return episodes
+
+
+def _group_rows(column: Column) -> Iterator[tuple[str, NDArray[np.intp]]]:
+    """Yields each value of a column with its rows, in order of appearance."""
+    _, first, group = np.unique(column, return_index=True, return_inverse=True)
+    for k in np.argsort(first):
+        yield _format_label(column[first[k]]), np.flatnonzero(group == k)
 
 
 def _split_by_time(

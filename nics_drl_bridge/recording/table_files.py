@@ -5,6 +5,7 @@ import re
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import chain
@@ -46,39 +47,45 @@ MISSING = ("", "na", "n/a", "null", "none", "-", "--", "#n/a")
 WORDS = {"true": "1", "false": "0", **dict.fromkeys(MISSING, "nan")}
 
 
+def read_text_table(path: Path) -> Table:
+    """Reads a table. Raises RecordingError with the file, the line and the fix."""
+    numbers, lines, comments = _read_lines(path)
+    separator = _find_separator(lines[:TRIED])
+    rows = list(map(partial(_split, separator=separator), lines))
+    first, width = _find_first_row(path, rows)
+    above = rows[:first]
+    rows, numbers, notes = _keep_one_width(
+        path, rows[first:], numbers[first:], above, width
+    )
+    head = _choose_head(above, width)
+    if head is None and comments:
+        head = _find_title(comments[-1], separator, width)
+    may_be_tum = separator is None or path.suffix == TUM_SUFFIX
+    columns = _make_columns(rows, head, may_be_tum)
+    return make_table(str(path), *columns, numbers, tuple(notes))
+
+
 def _choose_head(above: Sequence[list[str]], width: int) -> list[str] | None:
     """Returns the last title with the most distinct names: a row of units below it repeats some."""
     titles = [row for row in above if len(row) > 1 or width == 1]
     return max(reversed(titles), key=lambda row: len(set(row)), default=None)
 
 
-def read_text_table(path: Path) -> Table:
-    """Reads a table. Raises RecordingError with the file, the line and the fix."""
-    lines, comments = _read_lines(path)
-    separator = _find_separator([text for _, text in lines[:TRIED]])
-    line_numbers = np.array([line for line, _ in lines], dtype=np.intp)
-    rows = [_split(text, separator) for _, text in lines]
-    first, width = _find_first_row(path, rows)
-    above = rows[:first]
-    rows, line_numbers, notes = _keep_one_width(
-        path, rows[first:], line_numbers[first:], above, width
-    )
+def _make_columns(
+    rows: list[list[str]], head: list[str] | None, may_be_tum: bool
+) -> tuple[tuple[str, ...], list[Column]]:
+    """Returns names and values of the columns; without a head, the content may show the names."""
     columns = [list(column) for column in zip(*rows, strict=True)]
-    head = _choose_head(above, width)
-    if head is None and comments:
-        head = _find_title(comments[-1], separator, width)
-    may_be_tum = separator is None or path.suffix == TUM_SUFFIX
     if head is None and may_be_tum and _is_tum(columns):
         head = list(TUM)
     if head is None:
         columns, head = _split_labels(columns)
     names = tuple([*head, *[""] * len(columns)][: len(columns)])
-    data = [_convert_column(_replace_commas(column)) for column in columns]
-    return make_table(str(path), names, data, line_numbers, tuple(notes))
+    return names, [_convert_column(_replace_commas(column)) for column in columns]
 
 
-def _read_lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
-    """Returns the non-empty lines with their numbers from 1, and separately the comments."""
+def _read_lines(path: Path) -> tuple[NDArray[np.intp], list[str], list[str]]:
+    """Returns numbers from 1 and texts of the non-empty lines, and separately the comments."""
     check_no_device(path)
     try:
         if path.stat().st_size > MAX_TABLE_BYTES:
@@ -116,7 +123,8 @@ def _read_lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
         line.lstrip("#/% ") for _, line in lines if line.lstrip().startswith(COMMENTS)
     ]
     rows = [(k, line) for k, line in lines if not line.lstrip().startswith(COMMENTS)]
-    return rows, comments
+    numbers = np.array([k for k, _ in rows], dtype=np.intp)
+    return numbers, [line for _, line in rows], comments
 
 
 def _split(line: str, separator: str | None) -> list[str]:

@@ -34,6 +34,14 @@ def _integrate_substep(
     )
 
 
+def _chain_poses(relative: Array) -> Array:
+    """Returns the poses (T, 3) from which relative poses (T, 3) lead on, from the origin on."""
+    heading = np.concatenate([[0.0], np.cumsum(relative[:-1, 2])])
+    moved = geometry.rotate(relative[:, :2], heading)
+    position = np.concatenate([np.zeros((1, 2)), np.cumsum(moved[:-1], axis=0)])
+    return np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
+
+
 def record(
     spec: RobotSpec,
     rng: np.random.Generator,
@@ -48,7 +56,7 @@ def record(
     per_hold = round(hold / dt)
     holds = int(np.ceil(duration / hold))
     held = rng.uniform(spec.command_low, spec.command_high, (holds, len(spec.command)))
-    since = np.asarray(np.arange(per_hold * inner)[:, None] * h, dtype=np.float64)
+    since = h * np.arange(per_hold * inner, dtype=np.float64)[:, None]
     now = np.zeros(len(book.lag))
     states = []
     arcs = []
@@ -56,18 +64,13 @@ def record(
         states.append(book.respond(now, goal, since))
         arcs.append(_integrate_substep(book, now, goal, since, h))
         now = book.respond(now, goal, per_hold * inner * h)
-    # Relative poses (T, 3) are chained to poses (T, 3) at their starts, from the origin on.
-    state = np.concatenate(states)
-    relative = geometry.exp(np.concatenate(arcs))
-    heading = np.concatenate([[0.0], np.cumsum(relative[:-1, 2])])
-    moved = geometry.rotate(relative[:, :2], heading)
-    position = np.concatenate([np.zeros((1, 2)), np.cumsum(moved[:-1], axis=0)])
-    pose = np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
+    state = np.concatenate(states)[::inner]
+    pose = _chain_poses(geometry.exp(np.concatenate(arcs)))[::inner]
     t = np.asarray(np.arange(holds * per_hold) * dt, dtype=np.float64)
     return Recording(
         Stream(t, np.repeat(held, per_hold, axis=0)),
-        Stream(t, pose[::inner]),
-        Stream(t, state[::inner]) if spec.state else None,
+        Stream(t, pose),
+        Stream(t, state) if spec.state else None,
         source=f"textbook {spec.name}",
         variables=spec.variable_names,
         measured_by="truth",

@@ -328,21 +328,28 @@ def open_bag_sink(
         if not isinstance(error, Exception):  # Ctrl-C
             raise
         # A caller may have turned a fault of the storage into an error that names the path.
-        reason = _get_reason(fault or error)
-        rest = f"what was written until then lies in {unfinished}"
-        advice = (
-            "recover it with `mcap recover` or `ros2 bag reindex` where there is room"
-        )
-        if not written:
-            rest = "nothing was written yet"
-            advice = "choose another place"
-        raise RecordingError(f"{path}: {reason}; {rest}, {advice}.") from error
+        raise _explain_failure(
+            path, fault or error, unfinished if written else None
+        ) from error
     finally:
         if lock is not None:
             os.close(lock)
     beside.rmdir()
     if raised is not None:
         raise raised
+
+
+def _explain_failure(
+    path: Path, error: BaseException, unfinished: Path | None
+) -> RecordingError:
+    """Returns the error of a bag that could not be written, and what is `unfinished` of it."""
+    rest = "nothing was written yet, choose another place"
+    if unfinished is not None:
+        rest = (
+            f"what was written until then lies in {unfinished}, recover it with `mcap recover` or "
+            "`ros2 bag reindex` where there is room"
+        )
+    return RecordingError(f"{path}: {_get_reason(error)}; {rest}.")
 
 
 def _get_reason(error: BaseException) -> str:

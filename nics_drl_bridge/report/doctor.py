@@ -385,12 +385,20 @@ def _check_moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> F
         what = f"jumps {jumps.sum()} times, by up to {far[jumps].max():.2f} m"
         fix = "odom must be continuous (REP-105): corrections belong in map -> odom"
         yield odometry_error(what, fix)
-    keep = going & ~jumps
+    yield from _check_rates(poses, twists, dt, going & ~jumps)
+
+
+def _check_rates(
+    poses: Array, twists: Array, dt: Array, keep: NDArray[np.bool_]
+) -> Findings:
+    """Compares the twists with the changes of the poses in the steps (T - 1,) to `keep`."""
+    step = np.diff(poses[:, :2], axis=0)
     turn = np.asarray(wrap_angle(np.diff(poses[:, 2])))
     moves = 0.5 * (twists[1:] + twists[:-1]) * dt[:, None]
     middle = poses[:-1, 2] + 0.5 * turn
     ahead = np.cos(middle) * step[:, 0] + np.sin(middle) * step[:, 1]
-    if far[keep].sum() > LEAST_PATH_M or np.abs(moves[keep, 0]).sum() > 1.0:
+    path = np.hypot(step[:, 0], step[:, 1])[keep].sum()
+    if path > LEAST_PATH_M or np.abs(moves[keep, 0]).sum() > 1.0:
         yield from _compare_rates(
             "linear.x", ahead[keep], moves[keep, 0], UNITS[:3], "m/s"
         )

@@ -157,6 +157,16 @@ class Stops(NamedTuple):
     last_twist: Array  # (K, 3) at the end of the simulation
     holds_angle: NDArray[np.bool_]  # (K,) True where steering angles were held
 
+    def select(self, keep: NDArray[np.bool_]) -> "Stops":
+        """Returns the stops that a mask (K,) selects."""
+        return Stops(
+            self.twist[keep],
+            self.path[keep],
+            self.travel[keep],
+            self.last_twist[keep],
+            self.holds_angle[keep],
+        )
+
     def extend(self, twist: Array, creep: Array, dt: float) -> "Stops":
         """Returns the stops after another step of dt [s], without the twist (K, 3) of creeping."""
         speed = np.hypot(twist[:, 0], twist[:, 1])
@@ -390,14 +400,9 @@ def _simulate_stop(
     # A bias of its fit may make a model creep at rest.
     rest_state = _find_steady_states(robot, model, rest)
     creep = model.rates(_join_inputs(model, rest_state, rest))[:, :3]
-    twist = model.rates(_join_inputs(model, state, commands))[:, :3]
-    held = (gap == 0.0) & _select_angles(robot) & (commands != 0.0)
-    stops = Stops(
-        twist=twist,
-        path=np.zeros(len(commands)),
-        travel=np.zeros((len(commands), 3)),
-        last_twist=twist,
-        holds_angle=held.any(axis=1),
+    stops = _begin_stops(
+        twist=model.rates(_join_inputs(model, state, commands))[:, :3],
+        is_held=(gap == 0.0) & _select_angles(robot) & (commands != 0.0),
     )
     for step in range(round((MAX_STOP_S + model.delays.max(initial=0.0)) / dt)):
         change = _compute_change(ramp, model.delays, step, dt)
@@ -410,6 +415,17 @@ def _simulate_stop(
         if settled:
             break
     return stops
+
+
+def _begin_stops(twist: Array, is_held: NDArray[np.bool_]) -> Stops:
+    """Returns stops from twists (K, 3) at the command to stop; `is_held` (K, C) marks angles."""
+    return Stops(
+        twist=twist,
+        path=np.zeros(len(twist)),
+        travel=np.zeros((len(twist), 3)),
+        last_twist=twist,
+        holds_angle=np.asarray(is_held.any(axis=1)),
+    )
 
 
 def _select_angles(robot: RobotSpec) -> NDArray[np.bool_]:
@@ -453,39 +469,61 @@ def fit_bound(stops: Stops, radius: float, turns_count: bool) -> Braking:
         radius: of the circle around the footprint [m].
         turns_count: True if a turn alone sweeps new ground, because the footprint has corners.
     """
-    speed = np.hypot(stops.twist[:, 0], stops.twist[:, 1])
-    turn_speed = radius * np.abs(stops.twist[:, 2])
-    counts = speed + turn_speed > CREEP
-    if not counts.any():
+    is_moving = _measure_speed(stops) + radius * np.abs(stops.twist[:, 2]) > CREEP
+    stops = stops.select(is_moving)
+    if not len(stops.path):
         return Braking(0.0, math.inf)
-    twist = stops.twist[counts]
-    speed = speed[counts]
-    turn_speed = turn_speed[counts]
+    sweep = _measure_sweep(stops, radius)
+    turn_speed = radius * np.abs(stops.twist[:, 2])
+    bounds = []
+    fits = []
+    for lever, order in product(LEVERS, _list_orders(stops)):
+        bound = Braking(0.0, 1.0, lever * radius, order=order)
+        bounds.append(bound)
+        pace = bound.pace(stops.twist)
+        if turns_count:
+            pace = np.maximum(pace, turn_speed)
+        fits.append(_fit_tightest(sweep, pace))
+    # the first one that is nearly as tight as the tightest
+    max_slack = min(fit.slack for fit in fits) + NEGLIGIBLE
+    return next(
+        _round_bound(bound, fit)
+        for bound, fit in zip(bounds, fits, strict=True)
+        if fit.slack <= max_slack
+    )
+
+
+def _measure_speed(stops: Stops) -> Array:
+    """Returns the speeds (K,) at the command to stop [m/s]."""
+    return np.hypot(stops.twist[:, 0], stops.twist[:, 1])
+
+
+class _Sweep(NamedTuple):
+    """What K stops sweep, as `_fit_tightest` bounds it."""
+
+    speed: Array  # (K,) at the command to stop [m/s or rad/s]
+    distance: Array  # (K,) to rest [m or rad]
+    counts: NDArray[np.bool_]  # (K,) True where the slack of a bound counts
+    worst: Array  # distances relative to which it counts
+
+
+def _measure_sweep(stops: Stops, radius: float) -> _Sweep:
+    """Returns what the fastest point of the footprint sweeps; slack counts on straight ways."""
+    speed = _measure_speed(stops)
+    turn_speed = radius * np.abs(stops.twist[:, 2])
     whole = speed + turn_speed
-    distance = (stops.path + radius * stops.travel[:, 2])[counts]
+    distance = stops.path + radius * stops.travel[:, 2]
     straight = turn_speed <= STRAIGHT * speed
     if not straight.any():
         straight = np.ones_like(straight)
     worst = _compute_envelope(whole[straight], distance[straight])
-    slower_component = np.abs(twist[:, :2]).min(axis=1)
-    orders = _list_orders(slower_component > MINOR * speed)
-    bounds = []
-    fits = []
-    for lever, order in product(LEVERS, orders):
-        bound = Braking(0.0, 1.0, lever * radius, order=order)
-        bounds.append(bound)
-        pace = bound.pace(twist)
-        if turns_count:
-            pace = np.maximum(pace, turn_speed)
-        fits.append(_fit_tightest(whole, pace, distance, straight, worst))
-    max_slack = min(fit.slack for fit in fits) + NEGLIGIBLE
-    best = next(i for i, fit in enumerate(fits) if fit.slack <= max_slack)
-    return _round_bound(bounds[best], fits[best])
+    return _Sweep(whole, distance, straight, worst)
 
 
-def _list_orders(sideways: NDArray[np.bool_]) -> tuple[float, ...]:
+def _list_orders(stops: Stops) -> tuple[float, ...]:
     """Returns the candidates of `Braking.order`; they do not matter if nothing moves diagonally."""
-    if sideways.any():
+    slower_component = np.abs(stops.twist[:, :2]).min(axis=1)
+    if (slower_component > MINOR * _measure_speed(stops)).any():
         return ORDERS
     return (2.0,)
 
@@ -518,32 +556,27 @@ def _compute_envelope(speed: Array, distance: Array) -> Array:
     return envelope
 
 
-def _fit_tightest(
-    whole: Array,
-    pace: Array,
-    distance: Array,
-    straight: NDArray[np.bool_],
-    worst: Array,
-) -> _Fit:
-    """Fits distance <= whole * (reaction + pace * inverse) for all motions, with minimum slack.
+def _fit_tightest(sweep: _Sweep, pace: Array) -> _Fit:
+    """Fits distance <= speed * (reaction + pace * inverse) for all stops, with minimum slack.
 
-    The slack is the mean excess over the `worst` distances of the straight motions, as a fraction.
+    The slack is the mean excess over the `worst` distances, as a fraction.
     """
-    weight = 1.0 / (worst + SLACK_M)
-    ahead = whole[straight] * weight
-    cost = np.array([ahead.mean(), (ahead * pace[straight]).mean()])
-    rows = np.stack([-whole, -whole * pace], axis=-1)
-    result = scipy.optimize.linprog(cost, rows, -distance, bounds=(0.0, None))
+    weight = 1.0 / (sweep.worst + SLACK_M)
+    ahead = sweep.speed[sweep.counts] * weight
+    cost = np.array([ahead.mean(), (ahead * pace[sweep.counts]).mean()])
+    rows = np.stack([-sweep.speed, -sweep.speed * pace], axis=-1)
+    times = sweep.distance / sweep.speed
+    result = scipy.optimize.linprog(cost, rows, -sweep.distance, bounds=(0.0, None))
     if not result.success:
         return _Fit(
             slack=math.inf,
-            reaction_s=float((distance / whole).max()),
+            reaction_s=float(times.max()),
             inverse=0.0,
         )
     reaction, inverse = result.x
-    slack = float(cost @ result.x - (worst * weight).mean())
+    slack = float(cost @ result.x - (sweep.worst * weight).mean())
     # The solver meets each bound up to its tolerance.
-    missing = float((distance / whole - reaction - pace * inverse).max())
+    missing = float((times - reaction - pace * inverse).max())
     return _Fit(
         slack=slack,
         reaction_s=float(reaction) + max(missing, 0.0),
@@ -559,24 +592,13 @@ def fit_separate_bounds(stops: Stops, radius: float) -> Braking | None:
         radius: of the circle around the footprint [m].
     """
     rate = np.abs(stops.twist[:, 2])
-    speeds = np.abs(stops.twist[:, :2])
-    speed = np.hypot(speeds[:, 0], speeds[:, 1])
-    moves = speed > CREEP
+    moves = _measure_speed(stops) > CREEP
     turns = radius * rate > CREEP
     if not (moves.any() and turns.any()):
         return None
-    sideways = speeds.min(axis=1) > MINOR * speeds.max(axis=1)
-    bounds = [Braking(0.0, 1.0, order=order) for order in _list_orders(sideways[moves])]
-    fits = []
-    for bound in bounds:
-        pace = bound.pace(stops.twist)
-        fits.append(_fit_alone(speed[moves], pace[moves], stops.path[moves]))
-    best = min(range(len(fits)), key=lambda i: fits[i].slack)
-    bound = _round_bound(bounds[best], fits[best])
+    bound = _fit_path(stops.select(moves))
+    turn = _fit_turn(stops.select(turns))
     turned = stops.travel[:, 2]
-    turn_fit = _fit_alone(rate[turns], rate[turns], turned[turns])
-    turn_bound = _round_bound(Braking(0.0, 1.0), turn_fit)
-    turn = TurnBraking(turn_bound.reaction_s, turn_bound.deceleration)
     max_path = _bound_path(bound, stops.twist)
     max_turn = rate * turn.mean_time_s(rate)
     missed = np.maximum(stops.path - max_path, radius * (turned - max_turn))
@@ -592,6 +614,23 @@ def fit_separate_bounds(stops: Stops, radius: float) -> Braking | None:
     return replace(bound, turn=turn)
 
 
+def _fit_path(stops: Stops) -> Braking:
+    """Returns the tightest bound on the paths of moving robots, whatever they turn."""
+    speed = _measure_speed(stops)
+    bounds = [Braking(0.0, 1.0, order=order) for order in _list_orders(stops)]
+    fits = [_fit_alone(speed, bound.pace(stops.twist), stops.path) for bound in bounds]
+    best = min(range(len(fits)), key=lambda i: fits[i].slack)
+    return _round_bound(bounds[best], fits[best])
+
+
+def _fit_turn(stops: Stops) -> TurnBraking:
+    """Returns the tightest bound on the turns of turning robots, however they move."""
+    rate = np.abs(stops.twist[:, 2])
+    fit = _fit_alone(rate, rate, stops.travel[:, 2])
+    bound = _round_bound(Braking(0.0, 1.0), fit)
+    return TurnBraking(bound.reaction_s, bound.deceleration)
+
+
 def _find_min_fraction(distance: Array, bound: Array) -> float:
     """Returns the minimum ratio of distances (K,) to their bounds (K,).
 
@@ -605,7 +644,8 @@ def _find_min_fraction(distance: Array, bound: Array) -> float:
 
 def _fit_alone(speed: Array, pace: Array, distance: Array) -> _Fit:
     """Does the same as `_fit_tightest` for one component, which counts at all speeds."""
-    return _fit_tightest(speed, pace, distance, np.ones(len(speed), np.bool_), distance)
+    counts = np.ones(len(speed), np.bool_)
+    return _fit_tightest(_Sweep(speed, distance, counts, distance), pace)
 
 
 def _bound_path(bound: Braking, twist: Array) -> Array:

@@ -413,15 +413,9 @@ def make_wheeled(
             "correct `state:`.",
         )
     dofs = [POSE_RATES.index(dof) for dof in moves]
-    wheels_from_command = inverse
-    command_from_twist = np.eye(len(dofs))
-    names: tuple[str, ...] = ()
-    if all(c.unit == "rad/s" and c.cmd_vel is None for c in spec.command):
-        wheels_from_command = np.eye(len(inverse))
-        command_from_twist = inverse
-        names = wheels
-    fields = tuple(specs.CMD_VEL_FIELDS[dof] for dof in dofs)
-    columns = _find_columns(spec, fields, names, len(command_from_twist))
+    columns, wheels_from_command, command_from_twist = _read_wheeled_commands(
+        spec, dofs, inverse, wheels
+    )
     slip_factors = np.array([1.0, 1.0, slip])
     twist_from_wheels = forward * slip_factors[:, None]
     if _has_actuator_state(spec):
@@ -440,6 +434,21 @@ def make_wheeled(
         structure={dof: wheels if dof in moves else () for dof in POSE_RATES},
         command=compute_command,
     )
+
+
+def _read_wheeled_commands(
+    spec: RobotSpec, dofs: list[int], inverse: Array, wheels: tuple[str, ...]
+) -> tuple[list[int], Array, Array]:
+    """Returns the commands' indices, and the matrices to wheel speeds and from the twist.
+
+    See `make_wheeled`.
+    """
+    fields = tuple(specs.CMD_VEL_FIELDS[dof] for dof in dofs)
+    if all(c.unit == "rad/s" and c.cmd_vel is None for c in spec.command):
+        columns = _find_columns(spec, fields, wheels, len(inverse))
+        return columns, np.eye(len(inverse)), inverse
+    columns = _find_columns(spec, fields, (), len(dofs))
+    return columns, inverse, np.eye(len(dofs))
 
 
 def _has_actuator_state(spec: RobotSpec) -> bool:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
+from unittest import mock
 
 import pytest
 from command_line import nics, split_words
@@ -15,6 +16,7 @@ from gate.assurance.samples import PROTOCOL, fault, row
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.assure import _choose_faults, _is_as_expected, _tell
+from nics_drl_bridge.config import find_config
 from nics_drl_bridge.gate.assurance.protocol import (
     CLAIMS_BY_TURN_RATE,
     LIMITS,
@@ -24,19 +26,49 @@ from nics_drl_bridge.gate.assurance.protocol import (
 )
 from nics_drl_bridge.gate.assurance.results import summarise
 
-ORDER = (
-    "assure differential --limits differential --world arena --episodes 2 --faults 0"
-)
-DEADLINE_S = 200.0
+ORDER = "assure differential --limits mine.yaml --world arena --episodes 2 --faults 0"
+
+KILLED = """
+import os, signal, sys
+from nics_drl_bridge.commands.cli import main
+from nics_drl_bridge.gate.assurance.run import Run
+
+driven = []
+drive = Run.drive
+
+def drive_until_killed(run, trial):
+    driven.append(trial)
+    if len(driven) > 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return drive(run, trial)
+
+Run.drive = drive_until_killed
+sys.argv = ["nics", *sys.argv[1:]]
+main()
+"""
+
+
+def make_place(folder):
+    """A folder with a file of limits that may be changed."""
+    text = find_config("differential", "limits").read_text(encoding="utf-8")
+    (folder / "mine.yaml").write_text(text)
+    return folder
+
+
+@pytest.fixture
+def place(tmp_path):
+    return make_place(tmp_path)
 
 
 @pytest.fixture(scope="module")
 def evidence(tmp_path_factory):
-    """The folder above that of an uninterrupted run."""
-    folder = tmp_path_factory.mktemp("evidence")
-    done = nics(ORDER, "--out out", cwd=folder)
+    """The folder above that of an uninterrupted run, which wants faults but has no ROS 2."""
+    folder = make_place(tmp_path_factory.mktemp("evidence"))
+    with mock.patch.object(extensions, "find_lacking", return_value="rclpy"):
+        done = nics(ORDER.replace("--faults 0", "--faults 5"), "--out out", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "0 of 2" in done.stdout
+    assert "no faults over DDS: nics assure --faults needs the module" in done.stderr
     return folder
 
 
@@ -48,6 +80,7 @@ def read(folder):
 def test_the_evidence_has_counts_bounds_and_a_control_that_failed(evidence):
     result = read(evidence)
     assert result["complete"]
+    assert result["protocol"]["faults"] == 0
     for claim in (LIMITS, TOUCHES):
         assert result["claims"][claim]["trials"] == 2
         assert result["claims"][claim]["failures"] == 0
@@ -99,48 +132,40 @@ def test_a_run_whose_faults_were_not_all_injected_is_not_as_expected(tmp_path, c
 @pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.timeout(300)
-def test_a_run_that_was_killed_goes_on_bit_equal_to_one_that_was_not(
-    evidence, tmp_path
-):
-    log = tmp_path / "out" / "episodes.jsonl"
-    command = [sys.executable, "-m", "nics_drl_bridge.commands.cli"]
-    command += split_words(ORDER, "--out out")
-    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + DEADLINE_S
-    while not log.exists() or log.read_bytes().count(b"\n") < 2:
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+def test_a_run_that_was_killed_goes_on_bit_equal_to_one_that_was_not(evidence, place):
+    log = place / "out" / "episodes.jsonl"
+    command = [sys.executable, "-c", KILLED, *split_words(ORDER, "--out out")]
+    killed = subprocess.run(command, cwd=place, stderr=subprocess.DEVNULL)
+    assert killed.returncode == -signal.SIGKILL
     kept = log.read_bytes()
-    begun = read(tmp_path)
+    assert kept.count(b"\n") == 2
+    begun = read(place)
     assert not begun["complete"]
     assert begun["protocol_sha256"] == read(evidence)["protocol_sha256"]
-    done = nics(ORDER, "--out out", cwd=tmp_path)
+    done = nics(ORDER, "--out out", cwd=place)
     assert done.returncode == 0, done.stderr
-    assert log.read_bytes().startswith(kept[: kept.rindex(b"\n") + 1])
+    assert log.read_bytes().startswith(kept)
     for name in ("episodes.jsonl", "assurance.json", "assurance.html"):
         whole = (evidence / "out" / name).read_bytes()
-        assert (tmp_path / "out" / name).read_bytes() == whole
+        assert (place / "out" / name).read_bytes() == whole
 
 
 @pytest.mark.slow
-def test_without_the_gate_failures_are_found_clustered_and_replayed(tmp_path):
-    done = nics(ORDER, "--control no_gate --out out", cwd=tmp_path)
+def test_without_the_gate_failures_are_found_clustered_and_replayed(place):
+    done = nics(ORDER, "--control no_gate --out out", cwd=place)
     assert done.returncode == 0, done.stderr
-    result = read(tmp_path)
+    result = read(place)
     assert result["control"][TOUCHES]["failures"] > 0
     failed = next(row for row in result["failures"] if row["contact"])
     touched = [one for one in result["clusters"] if one["claim"] == TOUCHES]
     assert failed["seed"] in [seed for one in touched for seed in one["seeds"]]
-    page = (tmp_path / "out" / "assurance.html").read_text(encoding="utf-8")
+    page = (place / "out" / "assurance.html").read_text(encoding="utf-8")
     assert f"--replay {result['clusters'][0]['seeds'][0]}" in page
     again = f"--control no_gate --out out --json --replay {failed['seed']}"
-    replayed = json.loads(nics(ORDER, again, cwd=tmp_path).stdout)
+    replayed = json.loads(nics(ORDER, again, cwd=place).stdout)
     assert replayed["same"]
     assert replayed.items() >= failed.items()
-    assert (tmp_path / replayed["picture"]).read_bytes().startswith(b"\x89PNG")
+    assert (place / replayed["picture"]).read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.slow
@@ -169,27 +194,12 @@ def test_without_faults_the_protocol_is_the_same_with_ros_2_and_without(monkeypa
     assert _choose_faults(0) == with_ros_2 == {"faults": 0}
 
 
-def test_without_ros_2_the_claim_on_faults_is_told_as_not_tested(tmp_path, monkeypatch):
-    monkeypatch.setattr(extensions, "find_lacking", lambda modules: "rclpy")
-    words = ORDER.replace("--episodes 2 --faults 0", "--episodes 1 --faults 5")
-    done = nics(words, "--out out", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "no faults over DDS: nics assure --faults needs the module" in done.stderr
-    assert read(tmp_path)["protocol"]["faults"] == 0
-    page = (tmp_path / "out" / "assurance.html").read_text(encoding="utf-8")
-    assert "stopping in time was not tested" in page
-
-
-def test_other_limits_in_the_same_file_are_refused_by_their_hash(tmp_path):
-    from nics_drl_bridge.config import find_config
-
-    text = find_config("differential", "limits").read_text(encoding="utf-8")
-    mine = tmp_path / "mine.yaml"
-    words = ORDER.replace("--limits differential", "--limits mine.yaml")
-    mine.write_text(text)
-    assert nics(words, "--out out --episodes 1", cwd=tmp_path).returncode == 0
-    mine.write_text(text + "\n# changed\n")
-    refused = nics(words, "--out out --episodes 1", cwd=tmp_path)
+@pytest.mark.slow
+def test_other_limits_in_the_same_file_are_refused_by_their_hash(evidence, tmp_path):
+    folder = shutil.copytree(evidence, tmp_path / "copy")
+    with (folder / "mine.yaml").open("a") as limits:
+        limits.write("\n# changed\n")
+    refused = nics(ORDER, "--out out", cwd=folder)
     assert refused.returncode == 2
     assert "'hashes.limits file, SHA-256' was" in refused.stderr
 

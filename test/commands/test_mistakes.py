@@ -154,8 +154,8 @@ HEAVY = {"torch", "stable_baselines3", "rclpy", "matplotlib", "onnxruntime"}
 MODULES = {
     (
         "train",
-        "torch",
-    ): r"training needs the module 'torch'; pip install 'nics_drl_bridge\[train\]'",
+        "filelock",
+    ): r"training needs the module 'filelock'; pip install 'nics_drl_bridge\[train\]'",
     (
         "train",
         "onnx",
@@ -165,7 +165,7 @@ MODULES = {
     (
         "train --engine ray",
         "ray",
-    ): r"pip install 'nics_drl_bridge\[train,distributed\]'",
+    ): r"pip install 'nics_drl_bridge\[sb3,train,distributed\]'",
 }
 
 

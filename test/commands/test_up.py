@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import subprocess
 import sys
-import time
+from contextlib import suppress
 from pathlib import Path
 from unittest import mock
 
@@ -21,7 +22,6 @@ from nics_drl_bridge.nodes.starting import LAUNCHES, NodeStart
 NICS = [sys.executable, "-m", "nics_drl_bridge.commands.start"]
 COMPILED_S = 250.0  # for which the kernels may take
 ENDED_S = 30.0
-POLL_S = 0.05
 ARRIVE_S = 10.0
 ATTEMPTS = 6
 NODES = ("simulator_node", "command_gate", "middleware_node", "policy_node")
@@ -107,51 +107,47 @@ class Up:
     """`nics up` in a process of its own, and the commands that talk to its nodes."""
 
     def __init__(self, folder: Path, domain_id: int, *words: str) -> None:
-        self.log = folder / "up.log"
+        self.folder = folder
         self.environment = {**os.environ, "ROS_DOMAIN_ID": str(domain_id)}
-        with self.log.open("wb") as log:
-            self.process = subprocess.Popen(
-                [*NICS, "up", *words],
-                env=self.environment,
-                stdout=log,
-                stderr=log,
-                cwd=folder,
-                preexec_fn=lambda: signal.signal(
-                    signal.SIGINT, signal.default_int_handler
-                ),
-            )
-
-    @property
-    def text(self) -> str:
-        return self.log.read_text(encoding="utf-8", errors="replace")
+        self.text = ""
+        self.process = subprocess.Popen(
+            [*NICS, "up", *words],
+            env=self.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            cwd=folder,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
 
     @property
     def children(self) -> list[int]:
         pid = self.process.pid
-        return [
-            int(child)
-            for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-        ]
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+        return [int(child) for child in children.split()]
 
     def runs(self, *nodes: str) -> None:
-        deadline = time.monotonic() + COMPILED_S
         while not all(f"[{node}]: running" in self.text for node in nodes):
-            assert self.process.poll() is None, self.text
-            assert time.monotonic() < deadline, self.text
-            time.sleep(POLL_S)
+            line = self.process.stdout.readline()
+            assert line, self.text
+            self.text += line
 
     def tell(self, words: str) -> subprocess.CompletedProcess[str]:
         with mock.patch.dict(os.environ, self.environment):
-            return nics(words, cwd=self.log.parent)
+            return nics(words, cwd=self.folder)
+
+    def ends(self, within_s: float) -> int:
+        self.text += self.process.communicate(timeout=within_s)[0]
+        return self.process.returncode
 
     def end(self, number: int) -> int:
         self.process.send_signal(number)
-        return self.process.wait(ENDED_S)
+        return self.ends(ENDED_S)
 
     def kill(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
+        self.process.kill()
+        self.process.communicate()
 
 
 @pytest.fixture
@@ -171,11 +167,14 @@ def start(tmp_path):
 
 
 def gone(children):
-    deadline = time.monotonic() + ENDED_S
-    while any(Path(f"/proc/{child}").exists() for child in children):
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(POLL_S)
+    """Whether processes have ended, or do so soon."""
+    for child in children:
+        with suppress(ProcessLookupError):
+            process = os.pidfd_open(child)
+            ended, _, _ = select.select([process], [], [], ENDED_S)
+            os.close(process)
+            if not ended:
+                return False
     return True
 
 
@@ -263,8 +262,8 @@ def test_no_node_outlives_it_whatever_signal_ends_it(start, number):
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_node_that_can_not_start_ends_the_others_with_its_sentence(start):
-    up, _ = start("simulation", "policy:=dynamic_widow")
-    assert up.process.wait(COMPILED_S) == 2
+    up, _ = start("vehicle", "policy:=dynamic_widow")
+    assert up.ends(COMPILED_S) == 2
     assert "unknown policy 'dynamic_widow'; did you mean 'dynamic_window'?" in up.text
     assert "policy_node ended with code 2, so all nodes were ended" in up.text
 

@@ -72,8 +72,10 @@ FAULTS = (
     *("called", "held", "stuck", "frozen", "blind", "late", "ahead", "back", "lost"),
     *("uncertain", "leap", "wild", "unknown", "broken", "two", "many", "stopped"),
 )
+# Faults that show only after a path, with the time they take [units]; others show in half a second.
+SLOW = {"held": 70, "stuck": 70, "frozen": 128}
 # Robot, shield, number of beams, and changes of the configuration. Every robot has some of the
-# faults, the first and the third have all of them.
+# faults; a frozen scan shows on the car, because its gate looks for no held body.
 DRIVES = {
     "circle": ("differential", ROUND, 360, {}),
     "car": (
@@ -93,8 +95,10 @@ DRIVES = {
 }
 
 SOME_FAULTS = {
-    "car": FAULTS[::2],
-    "drifting": FAULTS[1::2],
+    "circle": FAULTS[1::2],
+    "car": (*FAULTS[::2], "frozen"),
+    "half blind": [fault for fault in FAULTS if fault != "frozen"],
+    "drifting": FAULTS[2::3],
     "simulated": FAULTS[::3],
 }
 
@@ -240,27 +244,36 @@ class FaultyDrive:
             if self.units % 32 == 0:
                 self.sums.append(projected(flatten(self.state)))
 
-    def break_down(self, fault, units=70):
-        """Stands, is armed, drives, has a fault, and is reset."""
+    def break_down(self, fault):
+        """Stands, is armed, drives, and has a fault; returns whether it is stopped at the end."""
         self.fault = ""
+        self.rng = np.random.default_rng(FAULTS.index(fault))
         self.body = self.rng.uniform(-1.0, 1.0, 3)
         self.give(Reset())
-        self.run(16)
-        self.give(Arm(2))
-        self.run(36)
+        self.run(40)
         self.give(Arm(1))
         self.run(30)
         self.fault = fault
         if fault == "asleep":
             self.units += 20
-        self.run(units)
+        self.run(SLOW.get(fault, 32))
+        return not self.decisions[-1].twist.any()
+
+    def recover(self):
+        """Has no fault any more, and is told to stand."""
+        self.fault = "stopped"
+        self.run(32)
 
 
-def record_drive(name):
+def record_drive(name, check=lambda drive, fault, stopped: None):
     """Yields what was decided around each fault, and the numbers of all states."""
     drive = FaultyDrive(*DRIVES[name])
+    drive.run(16)
+    drive.give(Arm(2))
     for fault in SOME_FAULTS.get(name, FAULTS):
-        drive.break_down(fault)
+        stopped = drive.break_down(fault)
+        drive.recover()
+        check(drive, fault, stopped)
         told = [(*each.twist, each.publish, each.shielded) for each in drive.decisions]
         yield drive.lines, [projected(told), *drive.sums]
         drive.lines = []

@@ -158,7 +158,7 @@ def test_a_robot_that_stops_following_is_stopped_within_a_second_at_any_phase(
 def test_a_robot_that_creeps_as_it_is_told_is_fine():
     rig = Rig()
     rig.wish = np.array([0.04, 0.0, 0.0])
-    rig.drive(5.0)
+    assert rig.drive(5.0).moves
 
 
 def test_a_push_after_a_long_pause_has_its_second():

@@ -102,9 +102,9 @@ def test_a_command_acts_one_latency_after_it_was_sent(latency):
         assert twist[0] == pytest.approx(float(moving))
 
 
-def simulated_drive(model, seconds, seed, pose_std=None, noise=1.0):
+def simulated_drive(simulator, seconds, seed, pose_std=None, noise=1.0):
     """Errors (T, 3) of the estimate and their covariances, in the robot's frame."""
-    simulator = FastSimulator(model, field(60.0))
+    model = simulator.model
     estimator = Estimator(model)
     rng = np.random.default_rng(seed)
     start = np.array([0.0, 0.0, 3.0])
@@ -134,7 +134,8 @@ def simulated_drive(model, seconds, seed, pose_std=None, noise=1.0):
 
 def test_poses_with_four_times_the_noise_that_was_told_keep_the_estimate_at_the_truth():
     std = 0.02
-    errors, covariances = simulated_drive(builtin_model("mecanum"), 20, 1, std, 4.0)
+    simulator = FastSimulator(builtin_model("mecanum"), field(60.0))
+    errors, covariances = simulated_drive(simulator, 20, 1, std, 4.0)
     assert np.abs(errors[100:]).max() < 0.4
     assert np.sqrt((errors[100:, :2] ** 2).mean()) < 2.0 * std
     assert np.linalg.eigvalsh(covariances).min() > 0.0
@@ -223,10 +224,10 @@ REST = [
 )
 def test_the_estimate_is_as_uncertain_as_it_claims(robot, pose_std):
     """The mean NEES of many drives lies within the 95 % band of chi-squared."""
-    model = noisy_model(robot)
+    simulator = FastSimulator(noisy_model(robot), field(60.0))
     nees = []
     for seed in range(RUNS):
-        errors, covariances = simulated_drive(model, 8, seed, pose_std)
+        errors, covariances = simulated_drive(simulator, 8, seed, pose_std)
         nees.append(errors[-1] @ np.linalg.solve(covariances[-1], errors[-1]))
     low, high = chi2.ppf([0.025, 0.975], 3 * RUNS) / RUNS
     assert low < np.mean(nees) < high

@@ -3,14 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from nics_drl_bridge.middleware import kernels
-from nics_drl_bridge.middleware.kernels import CommandLog, make_log
-
-
-def logged(log, time, command, needed):
-    limit = np.full(len(command), np.inf)
-    return CommandLog(
-        *kernels.insert_command(log, time, np.array(command), -limit, limit, needed)
-    )
+from nics_drl_bridge.middleware.kernels import insert_command, make_log
 
 
 def in_effect(log, time):
@@ -22,7 +15,7 @@ def test_the_order_of_adding_does_not_matter():
     times = rng.permutation(1000)[:100] * 10
     log = make_log([0.0])
     for time in times:
-        log = logged(log, int(time), [float(time)], -1)
+        log = insert_command(log, int(time), np.array([float(time)]), -1)
     assert log.effective[1:].tolist() == sorted(times.tolist())
     assert np.array_equal(log.commands[1:, 0], log.effective[1:])
     for now in rng.integers(0, 10_000, 100):
@@ -33,7 +26,7 @@ def test_the_order_of_adding_does_not_matter():
 def test_what_is_no_longer_needed_is_forgotten_and_all_else_kept():
     log = make_log([0.0])
     for k in range(1000):
-        log = logged(log, k, [float(k)], k - 50)
+        log = insert_command(log, k, np.array([float(k)]), k - 50)
         for back in (0, 1, 49, 50):  # just before the time that is needed, too
             assert in_effect(log, k - back + 1) == [float(max(k - back, 0))]
         assert in_effect(log, k - 50) == [float(max(k - 51, 0))]

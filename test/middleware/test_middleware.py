@@ -11,7 +11,7 @@ import pytest
 from robots import direct_model
 
 from middleware.rig import PERIOD, RANGES, SECOND, STILL, assert_same, state
-from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.generator import builtin_model, save_model
 from nics_drl_bridge.middleware.middleware import Middleware, TopicCache
 
 
@@ -169,15 +169,16 @@ def test_health_tells_rates_ages_refusals_and_innovations(middleware):
 
 
 USED = """
+import sys
 import numpy as np
-from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.generator import load_model
 from nics_drl_bridge.kernels import KERNELS
 from nics_drl_bridge.middleware.middleware import Middleware, rehearse
 
 def known():
     return {(kernel.__name__, types) for kernel in KERNELS for types in kernel.overloads}
 
-model = builtin_model("ackermann")
+model = load_model(sys.argv[1])
 view = rehearse(model)
 assert np.allclose(view.pose, 0.0) and np.allclose(view.twist, 0.0)
 assert np.isposinf(view.ranges).all() and view.scan_age_s == view.odom_age_s == 0.0
@@ -197,10 +198,10 @@ print(sorted(name for name, _ in known() - rehearsed))
 
 
 @pytest.mark.process
-def test_what_is_rehearsed_is_all_that_a_moving_robot_calls():
-    done = subprocess.run(
-        [sys.executable, "-c", USED], capture_output=True, text=True, check=True
-    )
+def test_what_is_rehearsed_is_all_that_a_moving_robot_calls(tmp_path):
+    save_model(builtin_model("ackermann"), tmp_path / "model")
+    command = [sys.executable, "-c", USED, tmp_path / "model"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
 
 

@@ -14,7 +14,7 @@ import bags
 
 from nics_drl_bridge.commands.cli import app
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.generator import builtin_model, save_model
 from nics_drl_bridge.middleware.playback import estimate, write_estimate
 
 DURATION_S = 4.0
@@ -68,17 +68,17 @@ def test_the_estimate_follows_the_drive(bag):
 
 
 @pytest.mark.process
-def test_a_drive_gives_the_same_estimate_bit_for_bit_in_every_process(bag):
+def test_a_drive_gives_the_same_estimate_bit_for_bit_in_every_process(bag, tmp_path):
+    save_model(MODEL, tmp_path / "model")
     code = (
-        "import sys; from pathlib import Path\n"
-        "from nics_drl_bridge.generator import builtin_model\n"
+        "import sys\n"
+        "from nics_drl_bridge.generator import load_model\n"
         "from nics_drl_bridge.middleware.playback import estimate\n"
-        "made = estimate(Path(sys.argv[1]), builtin_model('ackermann'), {'pose': '/pose'})\n"
-        "print(made.digest)"
+        "print(estimate(sys.argv[1], load_model(sys.argv[2]), {'pose': '/pose'}).digest)"
     )
-    other = subprocess.run(
-        [sys.executable, "-c", code, bag], capture_output=True, text=True, check=True
-    ).stdout.strip()
+    command = [sys.executable, "-c", code, bag, tmp_path / "model"]
+    other = subprocess.run(command, capture_output=True, text=True, check=True)
+    other = other.stdout.strip()
     assert len(other) == 64
     assert other == estimate(bag, MODEL, {"pose": "/pose"}).digest
     assert other != estimate(bag, MODEL, {}).digest

@@ -145,14 +145,9 @@ def direction_of(robot, command):
     ("name", "rate"),
     [
         ("ackermann", None),
-        ("differential", None),
-        ("jackal", None),
         ("mecanum", None),
-        ("tricycle", None),
         ("differential", 4.0),  # wheels that brake weakly [rad/s^2]
         ("jackal", 6.1),
-        ("mecanum", 4.0),
-        ("lorry", None),
         ("lorry", 3.0),
         ("wagon", 3.0),
         ("husky", None),

@@ -60,12 +60,17 @@ def read_bag_info(path: str | Path) -> BagInfo:
         start = int(times.min())
         end = int(times.max())
         topics = tuple(
-            _describe_topic(t, bag.types[t], ns - start, s)
-            for t, (ns, s) in received.items()
+            _describe_topic(topic, bag.types[topic], ns - start, delays)
+            for topic, (ns, delays) in received.items()
         )
-    files = [path] if path.is_file() else filter(Path.is_file, path.iterdir())
-    size = sum(file.stat().st_size for file in files)
+    size = _measure_size(path)
     return BagInfo(str(path), size, start, (end - start) * S_PER_NS, len(times), topics)
+
+
+def _measure_size(path: Path) -> int:
+    """Returns the total size of a bag's files [bytes]."""
+    files = [path] if path.is_file() else filter(Path.is_file, path.iterdir())
+    return sum(file.stat().st_size for file in files)
 
 
 def _read_receipt(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]:

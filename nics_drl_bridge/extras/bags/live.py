@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rcl_interfaces.srv import GetParameters
 from rclpy.duration import Duration
@@ -281,7 +281,7 @@ class _Player:
         )
         return True
 
-    def ready(self) -> None:
+    def wait_for_subscribers(self) -> None:
         publishers = self.publishers.values()
         count_subscribers = self._node.count_subscribers
         self._stopping.wait(DISCOVERY_S)
@@ -359,24 +359,23 @@ def play_bag(
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopping.set())
-    with open_bag(path) as bag:
-        kinds = {topic: bag.types[topic] for topic in _wanted(bag, topics, clock)}
-        offers = {topic: bag.offers(topic) for topic in kinds}
-        messages = {topic: bag.read_serialized(topic) for topic in kinds}
+    bag = _read_played(path, topics, clock)
     context = open_context([])
     node = Node("bag_player", context=context, start_parameter_services=False)
     try:
         player = _Player(node, stopping, rate, clock, namespace, lockstep)
         timed: list[Timed] = []
-        for topic, kind in kinds.items():
-            if player.offer(topic, kind, offers[topic]):
-                timed += ((ns, topic, data) for ns, data in messages[topic])
+        for topic in bag:
+            if player.offer(topic.name, topic.kind, topic.offers):
+                timed += ((ns, topic.name, data) for ns, data in topic.messages)
             else:
-                say(f"left out: {topic} is of {kind}, whose package is not installed.")
+                say(
+                    f"left out: {topic.name} is of {topic.kind}, whose package is not installed."
+                )
         timed.sort(key=lambda message: message[:2])  # by receive time, then by topic
         if not timed:
             raise RecordingError(f"{path}: contains nothing that can be played here.")
-        player.ready()
+        player.wait_for_subscribers()
         sent = player.play(timed)
         while loop and not stopping.is_set():
             sent += player.play(timed)
@@ -389,7 +388,24 @@ def play_bag(
         context.try_shutdown()
 
 
-def _wanted(bag: BagFile, topics: Sequence[str], clock: bool) -> list[str]:
+class _PlayedTopic(NamedTuple):
+    name: str
+    kind: str
+    offers: tuple[Offer, ...]
+    messages: list[tuple[int, bytes]]  # receive time [ns], data
+
+
+def _read_played(path: Path, topics: Sequence[str], clock: bool) -> list[_PlayedTopic]:
+    with open_bag(path) as bag:
+        return [
+            _PlayedTopic(
+                topic, bag.types[topic], bag.offers(topic), bag.read_serialized(topic)
+            )
+            for topic in _list_wanted(bag, topics, clock)
+        ]
+
+
+def _list_wanted(bag: BagFile, topics: Sequence[str], clock: bool) -> list[str]:
     names = [name if name.startswith("/") else f"/{name}" for name in topics]
     for name in names:
         if name not in bag.types:

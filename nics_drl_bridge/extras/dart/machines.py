@@ -164,18 +164,24 @@ def _read_robot(path: Path, machine: Machine, physics: Physics) -> DartBody:
     levels = []  # heights of the wheels' axles above the root
     for name in machine.joints:
         fitting = _find_fitting(name, pivots if name.startswith("steer") else wheels)
-        if len(fitting) != 1:
-            there = ", ".join(hinge.joint.getName() for hinge in hinges) or "none"
-            raise ConfigError(
-                f"robot {str(path)!r}: needs one joint as {name!r}, not {len(fitting)}; "
-                f"it has {there}."
-            )
+        _require_one(path, name, fitting, hinges)
         fitting[0].turn_positive()
         joints.append(fitting[0].joint)
         if fitting[0] in wheels:
             levels.append(fitting[0].place[2])
-    height = machine.radius - float(np.mean(levels))
-    return DartBody(skeleton, joints, height)
+    return DartBody(skeleton, joints, machine.radius - float(np.mean(levels)))
+
+
+def _require_one(
+    path: Path, name: str, fitting: list["_Hinge"], hinges: list["_Hinge"]
+) -> None:
+    """Raises ConfigError unless one of the hinges fits a joint of the machine."""
+    if len(fitting) != 1:
+        there = ", ".join(hinge.joint.getName() for hinge in hinges) or "none"
+        raise ConfigError(
+            f"robot {str(path)!r}: needs one joint as {name!r}, not {len(fitting)}; "
+            f"it has {there}."
+        )
 
 
 def _set_friction(body: Any, friction: float) -> None:

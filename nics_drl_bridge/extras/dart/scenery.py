@@ -125,11 +125,15 @@ def add_solid(
         let_touch(add_shape(body, capsule, transform))
         return add_shape(body, shapes.CylinderShape(solid.radius, height), transform)
     corners = pose[:2] + geometry.rotate(solid.corners, pose[2])
+    return _add_prism(body, corners, level, height)
+
+
+def _add_prism(body: Any, corners: Array, level: float, height: float) -> Any:
     _add_sides(body, corners, level, height)
     middle = corners.mean(axis=0)
     ends = (-0.5 * height, 0.5 * height)
     spheres = [(EDGE, [x, y, end]) for x, y in corners - middle for end in ends]
-    hull = shapes.MultiSphereConvexHullShape(spheres)
+    hull = dartpy.dynamics.MultiSphereConvexHullShape(spheres)
     return add_shape(body, hull, make_transform([*middle, level]))
 
 

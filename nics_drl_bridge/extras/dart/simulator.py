@@ -187,23 +187,9 @@ class DartSimulator(RayCastingSimulator):
 
     def _add_robots(self, seen: list[Any], obstacles: list[Any]) -> list[DartRig]:
         """Adds the robots, whose bumpers alone touch obstacles, and what their lidars see."""
-        spec = self.model.robot
-        height = self._machine.radius
-        rigs = []
-        bumpers = []
-        for m in range(self.data.pose.shape[1]):
-            body = make_body(self._machine, self._physics, self._file)
-            body.skeleton.setName(f"robot_{m}")
-            base = body.skeleton.getRootBodyNode()
-            level = height - body.height
-            bumpers.append(
-                [
-                    scenery.add_solid(base, solid, level, height)
-                    for solid in cut_shape(footprint_shape(spec))
-                ]
-            )
-            self._engine.addSkeleton(body.skeleton)
-            rigs.append(DartRig(self._engine, spec, self._machine, body, self._physics))
+        added = [self._add_robot(m) for m in range(self.data.pose.shape[1])]
+        rigs = [rig for rig, _ in added]
+        bumpers = [bumper for _, bumper in added]
         bases = [rig.base for rig in rigs]
         for rig in rigs:
             wheels = rig.base.getSkeleton().getBodyNodes()[1:]
@@ -216,6 +202,20 @@ class DartSimulator(RayCastingSimulator):
             others = [one for one in bumpers if one is not bumper]
             self._groups.append(scenery.make_group(sum(others, seen)))
         return rigs
+
+    def _add_robot(self, m: int) -> tuple[DartRig, list[Any]]:
+        """Adds a robot; returns its rig, and the shapes of its bumper."""
+        spec = self.model.robot
+        height = self._machine.radius
+        body = make_body(self._machine, self._physics, self._file)
+        body.skeleton.setName(f"robot_{m}")
+        base = body.skeleton.getRootBodyNode()
+        bumper = [
+            scenery.add_solid(base, solid, height - body.height, height)
+            for solid in cut_shape(footprint_shape(spec))
+        ]
+        self._engine.addSkeleton(body.skeleton)
+        return DartRig(self._engine, spec, self._machine, body, self._physics), bumper
 
     def place_obstacles(self, bodies: Array) -> None:
         """See `PhysicsSimulator`."""

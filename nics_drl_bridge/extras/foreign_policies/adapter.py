@@ -100,6 +100,7 @@ class Adapter:
         self._outputs = self._run_network(self._empty_inputs)
         self._output_sizes = {name: made.size for name, made in self._outputs.items()}
         self._check_inputs()
+        self._check_states()
         self._commands = self._check_commands()
         _, entries = self._step(np.zeros(scan_parts + AFTER_SCAN), {})
         # size of each entry of the state, in order
@@ -112,15 +113,8 @@ class Adapter:
 
     def run(self, observation: Rows, *state: Rows) -> list[AnyArray]:
         """Returns action and command (1, C), and the next state (1, S), for (1, O) and (1, S)."""
-        past: Entries = {}
-        first = 0
-        for name, size in self._state_sizes.items():
-            past[name] = state[0][0, first : first + size].astype(float)
-            first += size
-        begun = bool(past) and past["begun"][0] > 0.0
-        values, following = self._step(
-            observation[0].astype(float), past if begun else {}
-        )
+        past = self._unpack_state(state[0][0]) if state else {}
+        values, following = self._step(observation[0].astype(float), past)
         low = self._robot.command_low
         high = self._robot.command_high
         command = np.clip(values, low, high)
@@ -130,6 +124,15 @@ class Adapter:
             entries = [following[name] for name in self._state_sizes]
             rows.append(np.concatenate([np.zeros(0), *entries]))
         return [row.astype(np.float32)[None] for row in rows]
+
+    def _unpack_state(self, state: Array) -> Entries:
+        """Returns the entries of a state (S,); none before the first step."""
+        past: Entries = {}
+        first = 0
+        for name, size in self._state_sizes.items():
+            past[name] = state[first : first + size].astype(float)
+            first += size
+        return past if past and past["begun"][0] > 0.0 else {}
 
     def _step(self, seen: Array, past: Entries) -> tuple[Array, Entries]:
         """Returns the command (C,), and what the next step may use; `past` is {} at first."""
@@ -142,7 +145,7 @@ class Adapter:
             following[f"state {name}"] = outputs[state.next].ravel()
         for name, made in outputs.items():
             following[f"output {name}"] = made.ravel()
-        return self._command(outputs, following), following
+        return self._compute_command(outputs, following), following
 
     def _list_kept(self) -> list[str]:
         """Returns the names of what a step uses of the one before."""
@@ -162,14 +165,14 @@ class Adapter:
         is_fixed = all(isinstance(size, int) for size in end.shape)
         if end.type not in DTYPES or not is_fixed:
             reason = f"is {end.type} of shape {end.shape}, which can't be filled."
-            raise self._fault(f"inputs.{end.name}", reason)
+            raise self._make_error(f"inputs.{end.name}", reason)
         return np.zeros(end.shape, DTYPES[end.type])
 
     def _run_network(self, feeds: Mapping[str, AnyArray]) -> dict[str, Any]:
         outputs = run_network(self._session, self._source, dict(feeds))
         return dict(zip(self._names, outputs, strict=True))
 
-    def _fault(self, place: str, reason: str) -> PolicyError:
+    def _make_error(self, place: str, reason: str) -> PolicyError:
         return PolicyError(self._source, place, reason)
 
     # Whether network, mapping and robot fit together.
@@ -181,20 +184,22 @@ class Adapter:
             for name in names:
                 if name not in inputs:
                     fix = suggest(name, inputs)
-                    raise self._fault(
+                    raise self._make_error(
                         f"{place}.{name}", f"the network has no such input; {fix}"
                     )
         for name in inputs:
             if name not in mapping.inputs and name not in mapping.states:
                 reason = "the network has this input, but the mapping does not; add it."
-                raise self._fault(f"inputs.{name}", reason)
+                raise self._make_error(f"inputs.{name}", reason)
             if name in mapping.inputs and name in mapping.states:
                 reason = "is also listed under inputs; keep one of the two."
-                raise self._fault(f"states.{name}", reason)
+                raise self._make_error(f"states.{name}", reason)
         for place, name in self._list_used_outputs():
             if name not in self._names:
                 fix = suggest(name, self._names)
-                raise self._fault(place, f"the network has no output {name!r}; {fix}")
+                raise self._make_error(
+                    place, f"the network has no output {name!r}; {fix}"
+                )
 
     def _list_used_outputs(self) -> Iterator[tuple[str, str]]:
         """Yields each output that the mapping names, after the place where it does."""
@@ -223,11 +228,13 @@ class Adapter:
                 listed = ", ".join(f"{part.of} {size}" for part, size in parts)
                 takes = f"the network takes {empty.shape}"
                 reason = f"{takes}, but the parts have {sum(sizes)} ({listed})."
-                raise self._fault(f"inputs.{name}", reason)
+                raise self._make_error(f"inputs.{name}", reason)
             self._check_scaling(mapped, sum(sizes), f"inputs.{name}")
             for k, part in enumerate(mapped.parts):
                 size = sizes[k] // part.history
                 self._check_scaling(part, size, f"inputs.{name}.parts.{k}")
+
+    def _check_states(self) -> None:
         for name, state in self._mapping.states.items():
             size = self._empty_inputs[name].size
             made = self._output_sizes[state.next]
@@ -235,7 +242,7 @@ class Adapter:
                 reason = (
                     f"{state.next!r} has {made} elements, but the state has {size}."
                 )
-                raise self._fault(f"states.{name}.next", reason)
+                raise self._make_error(f"states.{name}.next", reason)
             self._check_count(state.start, size, f"states.{name}.start")
 
     def _check_scaling(self, scaled: Scaled, size: int, place: str) -> None:
@@ -245,7 +252,7 @@ class Adapter:
     def _check_count(self, values: Numbers, size: int, place: str) -> None:
         if isinstance(values, tuple) and len(values) != size:
             reason = f"has {len(values)} numbers, but {size} are needed."
-            raise self._fault(place, reason)
+            raise self._make_error(place, reason)
 
     def _check_commands(self) -> tuple[str, ...]:
         """Returns the names of the commands: of a twist, or the robot's own."""
@@ -258,49 +265,49 @@ class Adapter:
                 reason = (
                     f"are {count}, but the output {choices.of!r} has {size} elements."
                 )
-                raise self._fault("choices.commands", reason)
+                raise self._make_error("choices.commands", reason)
             named = {name for row in choices.commands for name in row}
-            return self._names_of(named, "choices")
-        names = self._names_of(outputs, "outputs")
+            return self._check_names_of(named, "choices")
+        names = self._check_names_of(outputs, "outputs")
         needed = ("forward", "turn") if names == TWIST else names
         for name in needed:
             if name not in outputs:
                 reason = "is missing; name the output to use."
-                raise self._fault(f"outputs.{name}", reason)
+                raise self._make_error(f"outputs.{name}", reason)
         fields = [command.cmd_vel for command in self._robot.command]
         for name, command in outputs.items():
             if names == TWIST and FIELDS[name] not in fields:
                 reason = (
                     f"the robot {self._robot.name!r} has no command for it; remove it."
                 )
-                raise self._fault(f"outputs.{name}", reason)
+                raise self._make_error(f"outputs.{name}", reason)
             size = math.inf if command.of is None else self._output_sizes[command.of]
             if command.index >= size:
                 reason = f"the output {command.of!r} has only {size} elements"
                 reason = f"is {command.index}, but {reason}."
-                raise self._fault(f"outputs.{name}.index", reason)
+                raise self._make_error(f"outputs.{name}.index", reason)
         return names
 
-    def _names_of(self, named: Iterable[str], place: str) -> tuple[str, ...]:
+    def _check_names_of(self, named: Iterable[str], place: str) -> tuple[str, ...]:
         robot = self._robot
         commands = tuple(command.name for command in robot.command)
         if all(name in TWIST for name in named):
             if not robot.takes_cmd_vel:
                 fix = f"map {', '.join(commands)}."
                 reason = f"the robot {robot.name!r} is not driven by cmd_vel; {fix}"
-                raise self._fault(place, reason)
+                raise self._make_error(place, reason)
             return TWIST
         for name in named:
             if name not in commands:
                 fix = suggest(name, (*TWIST, *commands))
                 reason = f"the robot has no such command; {fix}"
-                raise self._fault(f"{place}.{name}", reason)
+                raise self._make_error(f"{place}.{name}", reason)
         for name, mapped in self._mapping.inputs.items():
             for part in mapped.parts:
                 if part.of.startswith("last.") and part.output is None:
                     owners = "policies that command forward, left and turn"
                     reason = f"{part.of} is only available to {owners}."
-                    raise self._fault(f"inputs.{name}", reason)
+                    raise self._make_error(f"inputs.{name}", reason)
         return commands
 
     # Inputs.
@@ -312,7 +319,7 @@ class Adapter:
         mapped = self._mapping.inputs.get(name)
         if mapped is not None:
             rows = [
-                self._part(f"history {name} {k}", part, seen, past, following)
+                self._read_part(f"history {name} {k}", part, seen, past, following)
                 for k, part in enumerate(mapped.parts)
             ]
             values = scale(np.concatenate(rows), mapped)
@@ -321,7 +328,7 @@ class Adapter:
             values = past.get(f"state {name}", start)
         return values.reshape(empty.shape).astype(empty.dtype)
 
-    def _part(
+    def _read_part(
         self,
         key: str,
         part: InputPart,
@@ -329,7 +336,7 @@ class Adapter:
         past: Entries,
         following: Entries,
     ) -> Array:
-        row = scale(self._quantity(part, seen, past), part)
+        row = scale(self._read_quantity(part, seen, past), part)
         if part.history == 1:
             return row
         earlier = past.get(key, np.tile(row, part.history - 1))
@@ -339,7 +346,7 @@ class Adapter:
             rows = rows.reshape(part.history, -1)[::-1].ravel()
         return rows
 
-    def _quantity(self, part: InputPart, seen: Array, past: Entries) -> Array:
+    def _read_quantity(self, part: InputPart, seen: Array, past: Entries) -> Array:
         """Returns a quantity (K,) in SI units."""
         scan = seen[: self._scan_parts] * self._range_max
         distance, cosine, sine, *velocity = seen[self._scan_parts :]
@@ -367,14 +374,14 @@ class Adapter:
 
     # Outputs.
 
-    def _command(self, outputs: Mapping[str, Any], following: Entries) -> Array:
+    def _compute_command(self, outputs: Mapping[str, Any], following: Entries) -> Array:
         """Returns the robot's command (C,), NaN for a choice that does not exist."""
         choices = self._mapping.choices
         if choices is None:
             mapped = self._mapping.outputs
             values = np.array(
                 [
-                    self._element(mapped.get(name, OutputCommand()), outputs)
+                    self._read_element(mapped.get(name, OutputCommand()), outputs)
                     for name in self._commands
                 ]
             )
@@ -388,7 +395,9 @@ class Adapter:
             values = np.array([speed, values[1], angle])
         return self._robot.from_fields(values)
 
-    def _element(self, command: OutputCommand, outputs: Mapping[str, Any]) -> float:
+    def _read_element(
+        self, command: OutputCommand, outputs: Mapping[str, Any]
+    ) -> float:
         value = np.array(command.add)
         if command.of is not None:
             element = outputs[command.of].ravel()[command.index].astype(float)

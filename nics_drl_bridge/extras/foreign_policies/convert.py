@@ -125,11 +125,7 @@ def _convert(foreign: ForeignNetwork, model: SimulatorModel | None) -> bytes:
             raise ConfigError(f"{source}: names no robot; {fix}")
         model = open_model(mapping.robot)
     _check_period(foreign, model.control_period)
-    try:
-        scan = layout_of(mapping.scan, model.lidar)
-        task = Navigation(model.robot, model.lidar, scan=scan)
-    except ConfigError as error:
-        raise ConfigError(f"{source}: key 'scan': {error}") from None
+    task = _make_task(mapping, model, source)
     network = _fix_shapes(foreign.model, mapping, task.scan_parts)
     del network.metadata_props[:]
     content = network.SerializeToString(deterministic=True)
@@ -139,17 +135,10 @@ def _convert(foreign: ForeignNetwork, model: SimulatorModel | None) -> bytes:
         mapping, task.robot, task.scan_parts, task.sight.range_max, session, source
     )
     size = adapter.state_size
-    seen = draw_golden_observations(task)
-    action, command = run_in_turn(adapter.run, seen, np.zeros(size, np.float32))
-    if not (np.isfinite(action).all() and np.isfinite(command).all()):
-        reason = (
-            "returns NaN or inf for ordinary observations; check scaling and weights."
-        )
-        raise PolicyError(source, "network", reason)
     text = make_contract(
         task,
         model,
-        {"observations": seen, "actions": action, "commands": command},
+        _record_golden_pairs(adapter, task, source),
         onnx_graph.hash_graph(network),
         {"network": mapping.network, "network_sha256": foreign.sha256},
         (size, 0.0) if size else None,
@@ -159,6 +148,32 @@ def _convert(foreign: ForeignNetwork, model: SimulatorModel | None) -> bytes:
     content = onnx_graph.add_seal(network.SerializeToString(deterministic=True))
     rehearsal.remember(content)  # the same graph, with a contract
     return content
+
+
+def _make_task(
+    mapping: ForeignPolicy, model: SimulatorModel, source: str
+) -> Navigation:
+    """Returns the task with the scan that a network sees. Raises ConfigError."""
+    try:
+        scan = layout_of(mapping.scan, model.lidar)
+        return Navigation(model.robot, model.lidar, scan=scan)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: key 'scan': {error}") from None
+
+
+def _record_golden_pairs(
+    adapter: Adapter, task: Navigation, source: str
+) -> dict[str, Any]:
+    """Returns observations, and what the network makes of them. Raises PolicyError for NaN."""
+    seen = draw_golden_observations(task)
+    start = np.zeros(adapter.state_size, np.float32)
+    action, command = run_in_turn(adapter.run, seen, start)
+    if not (np.isfinite(action).all() and np.isfinite(command).all()):
+        reason = (
+            "returns NaN or inf for ordinary observations; check scaling and weights."
+        )
+        raise PolicyError(source, "network", reason)
+    return {"observations": seen, "actions": action, "commands": command}
 
 
 def _fix_shapes(model: Any, mapping: ForeignPolicy, scan_parts: int) -> Any:

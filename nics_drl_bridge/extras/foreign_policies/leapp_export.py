@@ -7,7 +7,7 @@ back.
 
 import base64
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ from nics_drl_bridge.files import (
     write_whole_folder,
 )
 from nics_drl_bridge.policy.file import onnx_graph
-from nics_drl_bridge.policy.file.contract import Contract
+from nics_drl_bridge.policy.file.contract import Contract, StateEntry
 from nics_drl_bridge.policy.file.policy_file import PolicyFile
 
 NODE = "policy"
@@ -45,6 +45,16 @@ class Piece(NamedTuple):
     width: int
     kept: tuple[int, ...]
     facts: Data
+
+    @property
+    def is_whole(self) -> bool:
+        """True if the observation has all of its elements."""
+        return len(self.kept) == self.width
+
+    @property
+    def row(self) -> str:
+        """Name of its kept elements in the graph."""
+        return self.name if self.is_whole else f"{OURS}{self.name}"
 
 
 def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
@@ -69,13 +79,16 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
         write_bytes(temporary / network, made)
         state = policy.contract.state
         if state is not None:
-            start = np.full((1, state.size), state.start, np.float32)
-            arrays = {f"{NODE}/{onnx_graph.STATE_IN}": start}
-            write_bytes(temporary / start_values, safetensors.numpy.save(arrays))
+            write_bytes(temporary / start_values, _serialize_start(state))
         write_text(
             temporary / marker, dump_yaml(_describe_bundle(policy, pieces, made, place))
         )
     return place / marker
+
+
+def _serialize_start(state: StateEntry) -> bytes:
+    start = np.full((1, state.size), state.start, np.float32)
+    return bytes(safetensors.numpy.save({f"{NODE}/{onnx_graph.STATE_IN}": start}))
 
 
 def _list_pieces(policy: PolicyFile) -> list[Piece]:
@@ -130,14 +143,14 @@ GOAL_AND_TWIST = (
 )
 
 
-def _split_observation(model: Any, pieces: Iterable[Piece]) -> None:
+def _split_observation(model: Any, pieces: Sequence[Piece]) -> None:
     """Replaces the observation input of a graph by separate inputs and a concatenation."""
     graph = model.graph
     observation, *others = graph.input
-    taken = base64.b64encode(observation.SerializeToString()).decode()
-    model.metadata_props.add(key=TAKEN, value=taken)
+    model.metadata_props.add(
+        key=TAKEN, value=base64.b64encode(observation.SerializeToString()).decode()
+    )
     inputs = []
-    rows = []
     nodes = []
     weights = []
     for piece in pieces:
@@ -146,15 +159,13 @@ def _split_observation(model: Any, pieces: Iterable[Piece]) -> None:
         entry.name = piece.name
         entry.type.tensor_type.shape.dim[1].dim_value = piece.width
         inputs.append(entry)
-        row = piece.name
-        if len(piece.kept) < piece.width:
-            row = f"{OURS}{piece.name}"
-            places = f"{row}_places"
+        if not piece.is_whole:
+            places = f"{piece.row}_places"
             kept = np.array(piece.kept, np.int64)
             weights.append(onnx.numpy_helper.from_array(kept, places))
-            ends = [piece.name, places], [row]
+            ends = [piece.name, places], [piece.row]
             nodes.append(onnx.helper.make_node("Gather", *ends, axis=1))
-        rows.append(row)
+    rows = [piece.row for piece in pieces]
     nodes.append(onnx.helper.make_node("Concat", rows, [onnx_graph.INPUT], axis=1))
     _replace_all(graph.input, [*inputs, *others])
     _replace_all(graph.node, [*nodes, *graph.node])
@@ -198,31 +209,17 @@ def _describe_bundle(
     policy: PolicyFile, pieces: Iterable[Piece], made: bytes, place: Path
 ) -> Data:
     contract = policy.contract
-    name = place.resolve().name
     inputs = [
         _describe_tensor(piece.name, [1, piece.width], **piece.facts)
         for piece in pieces
     ]
     outputs = _describe_outputs(contract)
-    pipeline: Data = {
-        "configs": {
-            "frequency": 1.0 / contract.control_period,
-            "control_period": contract.control_period,
-            "robot": contract.robot.name,
-            "task": contract.task.name,
-        },
-        "data_flow": {},
-        "feedback_flow": {},
-        "inputs": {NODE: [piece.name for piece in pieces]},
-        "outputs": {NODE: [onnx_graph.ACTION, onnx_graph.COMMAND]},
-    }
+    pipeline = _describe_pipeline(contract, pieces)
     state = contract.state
     if state is not None:
-        source = f"{NODE}/{onnx_graph.STATE_OUT}"
-        target = f"{NODE}/{onnx_graph.STATE_IN}"
-        pipeline["feedback_flow"] = {source: [target]}
-        pipeline["initial_values"] = f"{name}_initial_values.safetensors"
-        pipeline["configs"]["longest_gap"] = state.longest_gap
+        pipeline["initial_values"] = (
+            f"{place.resolve().name}_initial_values.safetensors"
+        )
         inputs.append(_describe_tensor(onnx_graph.STATE_IN, [1, state.size]))
         outputs.append(_describe_tensor(onnx_graph.STATE_OUT, [1, state.size]))
     md5 = hashlib.md5(made, usedforsecurity=False).hexdigest()
@@ -235,6 +232,27 @@ def _describe_bundle(
     node = {"inputs": inputs, "outputs": outputs, "parameters": parameters}
     system = {"leapp config version": CONFIG_VERSION, "made by": onnx_graph.KEY}
     return {"models": {NODE: node}, "pipeline": pipeline, "system information": system}
+
+
+def _describe_pipeline(contract: Contract, pieces: Iterable[Piece]) -> Data:
+    pipeline: Data = {
+        "configs": {
+            "frequency": 1.0 / contract.control_period,
+            "control_period": contract.control_period,
+            "robot": contract.robot.name,
+            "task": contract.task.name,
+        },
+        "data_flow": {},
+        "feedback_flow": {},
+        "inputs": {NODE: [piece.name for piece in pieces]},
+        "outputs": {NODE: [onnx_graph.ACTION, onnx_graph.COMMAND]},
+    }
+    if contract.state is not None:
+        source = f"{NODE}/{onnx_graph.STATE_OUT}"
+        target = f"{NODE}/{onnx_graph.STATE_IN}"
+        pipeline["feedback_flow"] = {source: [target]}
+        pipeline["configs"]["longest_gap"] = contract.state.longest_gap
+    return pipeline
 
 
 def _describe_outputs(contract: Contract) -> list[Data]:

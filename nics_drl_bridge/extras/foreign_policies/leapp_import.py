@@ -169,21 +169,27 @@ def read_bundle(path: Path) -> Bundle:
     starts = {}
     if pipeline.initial_values is not None:
         starts = _read_starts(path, pipeline.initial_values)
-    states = {
-        names[target]: ForeignState(next=names[out], start=starts.get(target, 0.0))
-        for out, targets in pipeline.feedback_flow.items()
-        for target in targets
-    }
     return Bundle(
         path,
         pipeline,
         _find_tensors(description, "inputs", names, source),
         _find_tensors(description, "outputs", names, source),
-        states,
+        _list_states(pipeline, names, starts),
         _join(models, pipeline.data_flow, names, source),
         hash_bytes("".join(digests).encode()),
         restore_policy(next(iter(models.values()))) if len(models) == 1 else None,
     )
+
+
+def _list_states(
+    pipeline: Pipeline, names: dict[str, str], starts: dict[str, tuple[float, ...]]
+) -> dict[str, ForeignState]:
+    """Returns the states that a bundle feeds back, by the names of their inputs."""
+    return {
+        names[target]: ForeignState(next=names[out], start=starts.get(target, 0.0))
+        for out, targets in pipeline.feedback_flow.items()
+        for target in targets
+    }
 
 
 def _name_ends(pipeline: Pipeline) -> dict[str, str]:
@@ -320,13 +326,8 @@ def _derive_parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[
     kind = entry.kind or ""
     extra = entry.model_extra or {}
     if kind == BEAMS or (kind == SECTORS and isinstance(extra.get("scan"), dict)):
-        layout = extra.get("scan")
-        data["scan"] = layout
-        far = (extra.get("lidar") if layout is None else layout) or {}
-        # "share" in bundles of earlier versions
-        is_fraction = str(extra.get("unit", "")).startswith(("fraction", "share"))
-        divisor = far.get("range_max", 1.0) if is_fraction else 1.0
-        return [{"of": "scan", "divide": divisor}]
+        data["scan"] = extra.get("scan")
+        return [{"of": "scan", "divide": _find_scan_divisor(extra)}]
     size = math.prod(entry.shape) if isinstance(entry.shape, list) else 0
     meanings = SEEN.get(kind, {})
     names = entry.names
@@ -343,6 +344,16 @@ def _derive_parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[
         raise PolicyError(str(bundle.path), f"pipeline.inputs.{name}", reason)
     zero = {"of": ZERO, "value": 0.0}
     return [zero if meanings[n] == ZERO else {"of": meanings[n]} for n in names]
+
+
+def _find_scan_divisor(extra: Data) -> float:
+    """Returns the range that is 1 in a scan; 1 if the scan is in metres."""
+    # "share" in bundles of earlier versions
+    if not str(extra.get("unit", "")).startswith(("fraction", "share")):
+        return 1.0
+    layout = extra.get("scan")
+    far = (extra.get("lidar") if layout is None else layout) or {}
+    return float(far.get("range_max", 1.0))
 
 
 def _add_commands(

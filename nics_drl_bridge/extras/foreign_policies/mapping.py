@@ -42,14 +42,14 @@ class Scaled(Schema):
 
     @field_validator("divide")
     @classmethod
-    def _not_zero(cls, divide: Numbers) -> Numbers:
+    def _check_divisor(cls, divide: Numbers) -> Numbers:
         if 0.0 in (divide if isinstance(divide, tuple) else (divide,)):
             raise ValueError("must not be 0")
         return divide
 
     @field_validator("limits", "clip")
     @classmethod
-    def _ordered(cls, limits: Limits | None) -> Limits | None:
+    def _check_order(cls, limits: Limits | None) -> Limits | None:
         if limits is not None and not limits[0] < limits[1]:
             raise ValueError("must be [minimum, maximum]")
         return limits
@@ -68,7 +68,7 @@ class InputPart(Scaled):
     value: Numbers | None = None  # numbers of a `constant`
 
     @model_validator(mode="after")
-    def _complete(self) -> "InputPart":
+    def _check_keys(self) -> "InputPart":
         for key, owner in (("output", "last.output"), ("value", "constant")):
             if (getattr(self, key) is not None) != (self.of == owner):
                 verb = "needs" if self.of == owner else "has no"
@@ -137,7 +137,7 @@ class ForeignPolicy(Schema):
     choices: Choices | None = None
 
     @model_validator(mode="after")
-    def _one_way_out(self) -> "ForeignPolicy":
+    def _check_outputs(self) -> "ForeignPolicy":
         if bool(self.outputs) == (self.choices is not None):
             raise ValueError("give either `outputs:` or `choices:`")
         return self

@@ -138,11 +138,6 @@ def _design_ackermann(p: Parameters) -> Machine:
     wheelbase = p["wheelbase"]
     track, radius = track_and_radius(p)
     half_ratio = 0.5 * track / wheelbase
-    wheels = []
-    for side, y in (("left", 0.5 * track), ("right", -0.5 * track)):
-        wheels.append(Wheel(f"rear_{side}", (0.0, y)))
-        steering = f"steer_{side}"
-        wheels.append(Wheel(f"front_{side}", (wheelbase, y), False, steering))
 
     def controls(state: Array) -> Array:
         speed, steering = state
@@ -152,7 +147,7 @@ def _design_ackermann(p: Parameters) -> Machine:
         right = t / (1.0 + half_ratio * t)
         return np.array([speed / radius, np.arctan(left), np.arctan(right)])
 
-    def measured(position: Array, speed: Array) -> Array:
+    def measure_state(position: Array, speed: Array) -> Array:
         tangents = np.tan(position[2:])
         middle = tangents / (1.0 + half_ratio * np.array([1.0, -1.0]) * tangents)
         return np.array(
@@ -164,13 +159,22 @@ def _design_ackermann(p: Parameters) -> Machine:
         radius=radius,
         centre=(0.45 * wheelbase, 0.0, 0.0),
         size=(1.3 * wheelbase, 0.7 * track, 0.04),
-        wheels=tuple(wheels),
+        wheels=_place_ackermann_wheels(wheelbase, track),
         lags=(p["speed_lag"], p["steering_lag"]),
         joints=("rear_left", "rear_right", "steer_left", "steer_right"),
         controls=controls,
-        state=measured,
+        state=measure_state,
         half_ratio=half_ratio,
     )
+
+
+def _place_ackermann_wheels(wheelbase: float, track: float) -> tuple[Wheel, ...]:
+    wheels = []
+    for side, y in (("left", 0.5 * track), ("right", -0.5 * track)):
+        wheels.append(Wheel(f"rear_{side}", (0.0, y)))
+        steering = f"steer_{side}"
+        wheels.append(Wheel(f"front_{side}", (wheelbase, y), False, steering))
+    return tuple(wheels)
 
 
 def _design_differential(p: Parameters) -> Machine:

@@ -32,7 +32,6 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 # approximate period of encoder readings and of updates of moving obstacles
 ENCODER_PERIOD_S = 0.01
 LARGEST_TILT_RAD = 0.5
-MOTION = ("pose", "twist", "state")
 
 
 @dataclass(frozen=True)
@@ -309,36 +308,44 @@ class PhysicsSimulator(DrivenSimulator, ABC):
         wheels = self.wheels.copy()
         counted = np.zeros((len(rigs), 3))
         touched = np.zeros(len(rigs), np.bool_)
-        joints = [rig.encoders() for rig in rigs]
-        headings = [rig.heading() for rig in rigs]
+        before = self._read_joints()
         for part in range(self._subperiods):
             for rig, command in zip(rigs, self.in_force(part * part_s), strict=True):
                 rig.command(command)
             self.place_obstacles(self.move_obstacles((part + 1) * part_s))
             touched[self.advance(self._steps)] = True
-            counted = self._measure_twists(joints, headings, part_s)
-            joints = [rig.encoders() for rig in rigs]
-            headings = [rig.heading() for rig in rigs]
+            now = self._read_joints()
+            counted = self._measure_twists(before, now, part_s)
+            before = now
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
         readings = [rig.read() for rig in rigs]
-        pose, twist, state = (
-            np.array([getattr(r, n) for r in readings]) for n in MOTION
+        self.end_period(
+            np.array([reading.pose for reading in readings]),
+            np.array([reading.twist for reading in readings]),
+            np.array([reading.state for reading in readings]),
+            wheels,
+            counted,
+            touched,
         )
-        self.end_period(pose, twist, state, wheels, counted, touched)
+
+    def _read_joints(self) -> tuple[Array, Array]:
+        """Returns the encoders' positions (M, J) and the headings (M,) of all robots."""
+        joints = np.array([rig.encoders() for rig in self._rigs])
+        return joints, np.array([rig.heading() for rig in self._rigs])
 
     def _measure_twists(
-        self, joints: Sequence[Array], headings: Sequence[float], part_s: float
+        self,
+        before: tuple[Array, Array],
+        now: tuple[Array, Array],
+        part_s: float,
     ) -> Array:
-        """Returns twists (M, 3) by wheel odometry, since the joints and headings before."""
-        states = []
-        for rig, before in zip(self._rigs, joints, strict=True):
-            now = rig.encoders()
-            mean = self._machine.state(0.5 * (before + now), (now - before) / part_s)
-            states.append(mean)
+        """Returns twists (M, 3) by wheel odometry between two results of `_read_joints`."""
+        middles = 0.5 * (before[0] + now[0])
+        speeds = (now[0] - before[0]) / part_s
+        states = list(map(self._machine.state, middles, speeds))
         twists = self._twist(np.array(states)) * self._machine.calibrated
         if self._machine.gyro:
-            turned = np.subtract([rig.heading() for rig in self._rigs], headings)
-            rates = geometry.wrap_angle(turned) / part_s
+            rates = geometry.wrap_angle(now[1] - before[1]) / part_s
             twists[:, 2] = rates + self._draw_gyro_errors()
         return np.asarray(twists)
 

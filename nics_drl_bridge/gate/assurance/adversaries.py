@@ -91,12 +91,12 @@ class Adversary:
         moved = geometry.exp(np.multiply.outer(horizons, twist))
         places = geometry.compose(truth.pose, moved)[..., :2]
         clearance = np.array(
-            [[wall_distance(x, y, truth.walls) for x, y in row] for row in places]
+            [[wall_distance(*place, truth.walls) for place in row] for row in places]
         )
         ahead = np.multiply.outer(horizons, truth.velocities)
-        for k, (x, y, radius) in enumerate(truth.circles):
-            centre = ahead[:, None, k] + (x, y)
-            distance = np.hypot(*np.moveaxis(places - centre, -1, 0)) - radius
+        for k, circle in enumerate(truth.circles):
+            centre = ahead[:, None, k] + circle[:2]
+            distance = np.hypot(*np.moveaxis(places - centre, -1, 0)) - circle[2]
             clearance = np.minimum(clearance, distance)
         return np.asarray(clearance.min(axis=0) - self._robot.footprint_radius)
 
