@@ -26,7 +26,6 @@ How it works:
 from typing import TypeVar
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import ArrayLike
 
 from nics_drl_bridge.generator import SimulatorModel
@@ -145,6 +144,9 @@ class Estimator:
         self._pose_jacobian = np.eye(3, 3 + size)
         # Rates Jacobian of a zero-length prediction: errors moved the state, but not yet the pose.
         self._start_jacobian = np.eye(3 + size, size, -3)
+        # Imported here, as filterpy loads scipy.stats: a second that an env without it saves.
+        from filterpy.kalman import ExtendedKalmanFilter
+
         self._filter = ExtendedKalmanFilter(3 + size, 3)
         self._clone: Clone | None = None
         # Predicted twist and its Jacobian; None once belief or commands have changed
