@@ -6,8 +6,9 @@ import os
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="needs the extra 'train'").set_num_threads(1)
+pytest.importorskip("torch", reason="needs the extra 'train'")
 
+import torch
 from extras.foreign_policies import nets
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from policy.policy_rig import export_remembering, network
@@ -24,6 +25,7 @@ from nics_drl_bridge.policy.train.export import export_policy
 from nodes.peer import PlayedRobot, odometry, stamp_ns
 
 pytestmark = pytest.mark.ros
+torch.set_num_threads(1)
 
 GOAL = [1.5, 0.5]
 START_NS = 10**9
