@@ -60,8 +60,7 @@ def messages(session: nox.Session) -> None:
     tests = [
         "test/nodes/test_simulator_node.py",
         "test/nodes/simulation_interfaces",
-        "test/nodes/test_map_to_odom.py",
-        "test/nodes/test_follow_path.py",
+        "test/nodes/test_frames.py",
         "test/campaigns/test_parts.py",
         f"{CAMPAIGN}[nav2_standards]",
         f"{CAMPAIGN}[standards]",
@@ -100,7 +99,7 @@ def upstream(session: nox.Session) -> None:
 @nox.session
 def clients(session: nox.Session) -> None:
     """Let other DDS clients, without ROS 2, read a simulator and drive it."""
-    session.install("cyclonedds==11.0.1", "rosless==0.5.0", "roswell==0.1.0")
+    session.install("cyclonedds==11.0.1", "rosless==0.5.0")
     session.run(
         sys.executable,
         "-m",

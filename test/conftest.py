@@ -95,7 +95,7 @@ def pytest_report_header(config: pytest.Config) -> str:
     if "ros" in left_out(config):
         return "ROS 2: its tests are left out"
     if find_spec("rclpy") is None:
-        return "ROS 2: none, its tests skip"
+        return "ROS 2: none, its tests skip or are left out"
     distribution = os.environ.get("ROS_DISTRO", "from wheels")
     return f"ROS 2: {distribution}, {os.environ.get('RMW_IMPLEMENTATION', 'its usual middleware')}"
 

@@ -164,11 +164,20 @@ def test_it_goes_the_whole_road_and_leaves_a_report(tmp_path, drive):
 @pytest.mark.process
 @pytest.mark.slow
 def test_ctrl_c_ends_it_and_all_that_it_started(
-    tmp_path, phase, pattern, episodes, policy
+    tmp_path, drive, phase, pattern, episodes, policy
 ):
     if phase == "training":
         pytest.importorskip("stable_baselines3")
-    words = ("--episodes", episodes, "--world", "empty", "--out", "out", *policy)
+    words = (
+        "--episodes",
+        episodes,
+        "--world",
+        "empty",
+        "--out",
+        "out",
+        *policy,
+        *drive,
+    )
     with demo(*words, cwd=tmp_path) as running:
         running.until(pattern)
         if phase in ("over DDS", "in real time"):

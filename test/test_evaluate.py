@@ -1,15 +1,12 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import nics, split_words
+from command_line import nics
 from domains import claimed_domain
 
 from nics_drl_bridge import defaults, geometry
@@ -20,20 +17,17 @@ from nics_drl_bridge.robot.spec import load_robot
 
 ROOT = Path(__file__).resolve().parents[1]
 PNG = b"\x89PNG"
-DEADLINE_S = 280.0
+DEADLINE_S = 100.0
 missing = [name for name in ("rclpy", "mujoco") if find_spec(name) is None]
 needs_nodes = pytest.mark.skipif(bool(missing), reason=f"needs {' and '.join(missing)}")
 
 
-def started(*words, cwd, domain_id):
-    return subprocess.run(
-        [sys.executable, "-m", "nics_drl_bridge.commands.cli", *split_words(*words)],
-        cwd=cwd,
-        env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
-        capture_output=True,
-        text=True,
-        timeout=DEADLINE_S,
-    )
+@pytest.fixture
+def domain_id(monkeypatch):
+    with claimed_domain() as domain_id:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield domain_id
 
 
 def driven(done, folder):
@@ -50,10 +44,8 @@ BASELINE = "evaluate dynamic_window --model differential --episodes 2 --out out"
 @pytest.mark.process
 @pytest.mark.slow
 @needs_nodes
-def test_the_same_episodes_are_driven_by_other_physics_over_dds(tmp_path):
-    words = "--in fast --in mujoco_dds"
-    with claimed_domain() as domain_id:
-        done = started(BASELINE, words, cwd=tmp_path, domain_id=domain_id)
+def test_the_same_episodes_are_driven_by_other_physics_over_dds(tmp_path, domain_id):
+    done = nics(BASELINE, "--in fast --in mujoco_dds", cwd=tmp_path)
     places = driven(done, tmp_path)["policies"]["dynamic_window"]
     for figures in places.values():
         assert [one["seed"] for one in figures["each"]] == [1_000_000, 1_000_001]
@@ -80,16 +72,16 @@ def test_an_evaluation_in_the_folder_of_another_says_that_it_replaces_it(tmp_pat
 @pytest.mark.process
 @pytest.mark.slow
 @needs_nodes
-def test_lidar_randomisation_and_gate_are_the_same_in_process_and_over_dds(tmp_path):
+def test_lidar_randomisation_and_gate_are_the_same_in_process_and_over_dds(
+    tmp_path, domain_id
+):
     conditions = {
         "lidar": "rplidar_a2",
         "randomisation": "mild",
         "gate": "differential",
     }
     words = [f"--{name}={value}" for name, value in conditions.items()]
-    words += ["--in", "fast", "--in", "dds"]
-    with claimed_domain() as domain_id:
-        done = started(BASELINE, *words, cwd=tmp_path, domain_id=domain_id)
+    done = nics(BASELINE, *words, "--in fast --in dds", cwd=tmp_path)
     told = driven(done, tmp_path)
     others = {"steps": 300, "task": {}, "kind": None}
     assert told["conditions"] == conditions | others
@@ -142,7 +134,7 @@ def test_several_policies_drive_the_same_episodes_in_one_table(tmp_path):
 
 
 @pytest.fixture
-def far_from_the_origin(tmp_path, monkeypatch):
+def far_from_the_origin(tmp_path, monkeypatch, domain_id):
     """A robot on a wide field whose odometry began elsewhere, behind what a gate listens to."""
     from nics_drl_bridge.commands import episodes as vehicle
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness
@@ -161,18 +153,14 @@ def far_from_the_origin(tmp_path, monkeypatch):
         vehicle, "examine", lambda facts, expected: []
     )  # of a busy machine
     monkeypatch.setattr(defaults, "LISTEN_S", 0.1)
-    with claimed_domain() as domain_id:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
-        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        raw = {"cmd_vel": "cmd_vel_raw"}
-        with (
-            NodeProcess(
-                "simulator_node", tmp_path / "logs", given, domain_id, remap=raw
-            ),
-            Witness(domain_id) as witness,
-        ):
-            assert witness.sees(DEADLINE_S)
-            yield witness
+    raw = {"cmd_vel": "cmd_vel_raw"}
+    logs = tmp_path / "logs"
+    with (
+        NodeProcess("simulator_node", logs, given, domain_id, remap=raw) as node,
+        Witness(domain_id) as witness,
+    ):
+        assert witness.sees(DEADLINE_S), node.log.read_text(encoding="utf-8")
+        yield witness
 
 
 def vehicle_order(folder):
@@ -233,10 +221,8 @@ def test_a_far_goal_is_refused_before_anything_is_waited_for_where_nobody_can_be
 @pytest.mark.process
 @pytest.mark.campaign
 @needs_nodes
-def test_a_vehicle_that_does_not_fit_its_model_is_not_driven(tmp_path):
-    with claimed_domain() as domain_id:  # nobody is there
-        words = f"{BASELINE} --hardware --yes"
-        done = started(words, cwd=tmp_path, domain_id=domain_id)
+def test_a_vehicle_that_does_not_fit_its_model_is_not_driven(tmp_path, domain_id):
+    done = nics(f"{BASELINE} --hardware --yes", cwd=tmp_path)  # nobody is there
     assert done.returncode == 2
     assert "the vehicle is not driven: " in done.stderr.splitlines()[-1]
     assert not (tmp_path / "out").exists()
@@ -247,7 +233,9 @@ def test_a_vehicle_that_does_not_fit_its_model_is_not_driven(tmp_path):
 @pytest.mark.slow
 @pytest.mark.campaign
 @needs_nodes
-def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monkeypatch):
+def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(
+    tmp_path, monkeypatch, domain_id
+):
     from nics_drl_bridge.commands import episodes as vehicle
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness
 
@@ -270,25 +258,22 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monke
     order = vehicle.EvaluationOrder(
         ["dynamic_window"], out, "differential", "empty", 1, 0
     )
-    with claimed_domain() as domain_id:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
-        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        world = model | {"world": "empty"}
-        with (
-            NodeProcess("simulator_node", logs, world, domain_id),
-            NodeProcess("middleware_node", logs, model, domain_id),
-            NodeProcess("command_gate", logs, gate, domain_id),
-        ):
-            with Witness(domain_id) as witness:  # it may be compiling
-                assert witness.sees(DEADLINE_S)
-            made = vehicle.drive_vehicle(
-                order,
-                GoalOrder(start="present"),
-                said.append,
-                said.append,
-                arm=True,
-                stale_after_s=DEADLINE_S,
-            )
+    world = model | {"world": "empty"}
+    with (
+        NodeProcess("simulator_node", logs, world, domain_id),
+        NodeProcess("middleware_node", logs, model, domain_id),
+        NodeProcess("command_gate", logs, gate, domain_id),
+    ):
+        with Witness(domain_id) as witness:  # it may be compiling
+            assert witness.sees(DEADLINE_S)
+        made = vehicle.drive_vehicle(
+            order,
+            GoalOrder(start="present"),
+            said.append,
+            said.append,
+            arm=True,
+            stale_after_s=DEADLINE_S,
+        )
     assert "  command_gate is armed" in said
     assert any("it will drive to" in line for line in said)
     (driven,), (beside,) = made.runs.values()

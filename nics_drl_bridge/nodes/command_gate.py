@@ -1,6 +1,5 @@
 """command_gate: passes the policy's commands on while they can be trusted."""
 
-import contextlib
 import math
 import os
 import time
@@ -51,6 +50,7 @@ from nics_drl_bridge.nodes import (
 from nics_drl_bridge.nodes.conversions import find_sensor_type
 from nics_drl_bridge.nodes.gate_inputs import TWIST, TWIST_STAMPED, Sources
 from nics_drl_bridge.nodes.gate_log import GateLog
+from nics_drl_bridge.nodes.own_process import take_priority
 
 SIM_TIME = "use_sim_time"
 FOREIGN_SETTINGS = {
@@ -61,11 +61,6 @@ FOREIGN_SETTINGS = {
 STALE_S = 0.05
 # default age limit of a command's scan for a slow lidar, in scan periods
 SCAN_PERIODS = 1.75
-REFUSED = (
-    "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
-    "allow it by `ulimit -r {priority}`, `LimitRTPRIO={priority}` in its systemd unit or the "
-    "capability CAP_SYS_NICE, or set 0. The gate runs without it."
-)
 
 
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
@@ -134,27 +129,6 @@ def _read_shield(
     config, sentence = shield_config(model, limits, file, values)
     node.get_logger().info(sentence)
     return config
-
-
-def take_priority(priority: int) -> str:
-    """Give all present threads SCHED_FIFO, unless 0; return reason and fix if refused, or ""."""
-    if priority == 0:
-        return ""
-    try:
-        for thread in ("0", *os.listdir("/proc/self/task")):
-            with contextlib.suppress(
-                ProcessLookupError
-            ):  # the thread has ended meanwhile
-                # the writers of black boxes run at ordinary priority
-                policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-                os.sched_setscheduler(int(thread), policy, os.sched_param(priority))
-    except (
-        OSError,
-        AttributeError,
-    ) as error:  # AttributeError: the system has no scheduler calls
-        reason = str(getattr(error, "strerror", None) or "it has none").lower()
-        return REFUSED.format(priority=priority, error=reason)
-    return ""
 
 
 class CommandGate(qos.BridgeNode):

@@ -2,7 +2,6 @@
 
 import math
 import multiprocessing
-import os
 import time
 from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection
@@ -11,9 +10,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
@@ -35,32 +31,21 @@ class NoMotionError(RuntimeError):
     """The gate was armed, but no command that moves the robot came."""
 
 
-def open_driver_context(domain_id: int | None) -> Context:
-    """Return a context as another vendor's driver has it, with shared memory."""
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    context = Context()
-    context.init(None, domain_id=domain_id)
-    return context
-
-
 def hear(domain_id: int | None, out: Connection) -> None:
     """Report for each `cmd_vel` when it arrived [s], its twist, and when it was written [ns].
 
     Ends with the parent process, even if that is killed.
     """
-    context = open_driver_context(domain_id)
-    node = Node("base", context=context, start_parameter_services=False)
+    base = SpunNode("base", domain_id)
 
     def tell(message: Twist, info: Mapping[str, Any]) -> None:
         twist = conversions.twist_from_ros(message)
         out.send((time.monotonic(), twist, info["source_timestamp"]))
 
-    node.create_subscription(Twist, "cmd_vel", tell, qos.COMMAND)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
+    base.node.create_subscription(Twist, "cmd_vel", tell, qos.COMMAND)
     parent = multiprocessing.parent_process()
     while parent is None or parent.is_alive():
-        executor.spin_once(timeout_sec=1.0)
+        base.spin(timeout_s=1.0)
 
 
 class Robot(SpunNode):
@@ -93,7 +78,7 @@ class Robot(SpunNode):
             skip: send only every so many-th scan, heartbeat and command.
             sensors: quality of service of scan and odometry.
         """
-        super().__init__("robot", context=open_driver_context(domain_id))
+        super().__init__("robot", domain_id)
         kinds = {
             "odom": (Odometry, sensors),
             "scan": (LaserScan, sensors),

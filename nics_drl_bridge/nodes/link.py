@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
@@ -40,7 +41,7 @@ from nics_drl_bridge.nodes.command_types import (
     describe_deaf_subscribers,
     expect_stamped,
 )
-from nics_drl_bridge.nodes.listener import holds, open_context
+from nics_drl_bridge.nodes.listener import ask, holds, open_context, spin
 from nics_drl_bridge.nodes.own_process import ENDING
 from nics_drl_bridge.nodes.parameters import is_stamped_default
 from nics_drl_bridge.nodes.runner import publish_last
@@ -48,14 +49,13 @@ from nics_drl_bridge.nodes.wire import write_stamped_twist, write_twist
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-SPIN_S = 0.2
 # Longest wait of the caller's thread for a callback, between two looks at its condition [s]. Always
 # the same, because rclpy drops callbacks that are ready when the timeout changes.
 POLL_S = 0.01
 NO_RANDOMISATION = "none"
 # key of the stamp of an episode's first data in a simulator's diagnostics
 EPISODE_NS = "episode began [ns]"
-# a request to repeat data counts as lost if unanswered for this long [s]
+# a request that may be sent again counts as lost if unanswered for this long [s]
 LOST_S = 1.0
 
 
@@ -153,7 +153,7 @@ class Link:
         """Let a thread run the callbacks; call it once all subscriptions exist."""
         self._thread = threading.Thread(
             target=_spin,
-            args=(self._executor, self._timeout),
+            args=(self.node, self._timeout),
             daemon=True,
             name="dds_backend",
         )
@@ -190,17 +190,15 @@ class Link:
         if not self._closing.alive or not self._context.ok():
             raise BackendError("this backend is closed; make another one.")
 
-    def call(self, client: Any, request: Any, timeout_s: float) -> Any:
-        """Call a service, and return its answer. Raises BackendError."""
-        deadline = time.monotonic() + timeout_s
-        # A server that hung for long was dropped and must be discovered again.
-        self.wait_until(client.service_is_ready, timeout_s)
-        future = client.call_async(request)
-        if not self.wait_until(future.done, deadline - time.monotonic()):
-            client.remove_pending_request(future)
+    def call(
+        self, client: Any, request: Any, timeout_s: float, again_s: float = math.inf
+    ) -> Any:
+        """Call a service, and again at a period; return the first answer. Raises BackendError."""
+        answer = ask(client, request, timeout_s, self.wait_until, again_s)
+        if answer is None:
             reason = f"no answer within {timeout_s:g} s; look at the simulator's log."
             raise BackendError(f"service {client.srv_name}: {reason}")
-        return future.result()
+        return answer
 
     def has_rivals(self) -> bool:
         """True if another node publishes commands too."""
@@ -304,17 +302,12 @@ class Interrupts:
 INTERRUPTS = Interrupts()
 
 
-def _spin(executor: SingleThreadedExecutor, timeout: CommandTimeout) -> None:
+def _spin(node: Node, timeout: CommandTimeout) -> None:
     try:
-        while executor.context.ok():
-            executor.spin_once(timeout_sec=SPIN_S)
-            timeout.look()
-    except Exception:  # another thread may have shut the context down meanwhile
-        if executor.context.ok():
-            raise
+        spin(node, threading.Event(), timeout.look)
     finally:  # after an error too, since nothing would notice old data
         timeout.end()
-        executor.context.try_shutdown()
+        node.context.try_shutdown()
 
 
 def _shut_down(undo: contextlib.ExitStack) -> None:
@@ -423,16 +416,22 @@ class EpisodeServices:
             for name, value in chosen.items()
         ]
         request = SetParametersAtomically.Request(parameters=settings)
+        # The middleware drops answers to clients that the simulator has not discovered yet, and a
+        # second reset would begin another episode. A simulator that answers the client that was
+        # made last knows the others, too.
+        self._require_same(self._read_facts(timeout_s))
         result = self._link.call(self._parameters, request, timeout_s).result
         if not result.successful:
             raise BackendError(f"the simulator refused the episode: {result.reason}")
         response = self._link.call(self._reset, Trigger.Request(), timeout_s)
         if not response.success:
             raise BackendError(f"the simulator could not reset: {response.message}")
-        tested = self._link.call(self._test, SelfTest.Request(), timeout_s)
-        facts = {pair.key: pair.value for pair in tested.status[0].values}
-        self._require_same(facts)
-        return int(facts[EPISODE_NS])
+        return int(self._read_facts(timeout_s)[EPISODE_NS])
+
+    def _read_facts(self, timeout_s: float) -> dict[str, str]:
+        """Return what the simulator tells about itself; asking again does no harm."""
+        tested = self._link.call(self._test, SelfTest.Request(), timeout_s, LOST_S)
+        return {pair.key: pair.value for pair in tested.status[0].values}
 
     def _require_same(self, facts: Mapping[str, str]) -> None:
         for key, mine in self._identity.items():

@@ -1,5 +1,6 @@
 """A node that listens in a thread of its own, as commands need it; imports no simulator."""
 
+import math
 import os
 import threading
 import time
@@ -55,13 +56,45 @@ def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:
     return True
 
 
-def spin(node: Node, stopping: threading.Event) -> None:
-    """Spin a node until `stopping` is set or its context has been shut down."""
+def ask(
+    client: Any,
+    request: Any,
+    timeout_s: float,
+    wait_until: Callable[[Callable[[], Any], float], bool],
+    again_s: float = math.inf,
+) -> Any:
+    """Call a service, and again at a period [s]; return the first answer, or None if none comes.
+
+    `wait_until` waits for a condition, at most for some seconds, while callbacks run. The
+    middleware drops an answer whose client the server has not discovered yet.
+    """
+    deadline = time.monotonic() + timeout_s
+    futures: list[Any] = []
+
+    def find_answered() -> Any:
+        return next((future for future in futures if future.done()), None)
+
+    while find_answered() is None and time.monotonic() < deadline:
+        # A server that hung for long was dropped and must be discovered again.
+        wait_until(client.service_is_ready, deadline - time.monotonic())
+        futures.append(client.call_async(request))
+        wait_until(find_answered, min(again_s, deadline - time.monotonic()))
+    for future in futures:
+        client.remove_pending_request(future)
+    answered = find_answered()
+    return None if answered is None else answered.result()
+
+
+def spin(
+    node: Node, stopping: threading.Event, look: Callable[[], None] = lambda: None
+) -> None:
+    """Spin a node until `stopping` is set or its context has been shut down; `look` often."""
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     try:
         while node.context.ok() and not stopping.is_set():
             executor.spin_once(timeout_sec=SPIN_S)
+            look()
     except Exception:  # another thread may have shut the context down meanwhile
         if node.context.ok():
             raise

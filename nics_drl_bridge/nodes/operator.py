@@ -72,40 +72,30 @@ def ask_until_granted(
 class Call:
     """A request to a service of a node, which is sent once the service is there."""
 
-    def __init__(
-        self, node: Node, server: str, service: str, kind: Any = Trigger
-    ) -> None:
+    def __init__(self, node: Node, server: str, service: str) -> None:
         self._node = node
         self._server = server
-        self._kind = kind
-        self._client = node.create_client(kind, f"{server}/{service}")
+        self._client = node.create_client(Trigger, f"{server}/{service}")
         self._future: Any = None
-
-    def wait_for_response(self, seconds: float) -> Any:
-        """Return the response, and end the call. Raises BackendError if none comes for so long."""
-        try:
-            holds(self.is_answered, max(seconds, 0.0), POLL_S)
-            if self._future is None:
-                raise BackendError("it has ended")
-            if not self._future.done():
-                reason = "it did not answer in time; the request may still take effect"
-                raise BackendError(reason)
-            return self._future.result()
-        finally:
-            self._node.destroy_client(self._client)
 
     def wait_for_answer(self, seconds: float) -> TriggerAnswer:
         """Return the answer, or why there is none after so long; end the call."""
-        try:
-            answer = self.wait_for_response(seconds)
-        except BackendError as error:
-            return TriggerAnswer(self._server, False, str(error))
-        return TriggerAnswer(self._server, bool(answer.success), str(answer.message))
+        is_answered = holds(self.is_answered, max(seconds, 0.0), POLL_S)
+        self._node.destroy_client(self._client)
+        if is_answered:
+            answer = self._future.result()
+            return TriggerAnswer(
+                self._server, bool(answer.success), str(answer.message)
+            )
+        why = "it did not answer in time; the request may still take effect"
+        if self._future is None:
+            why = "it has ended"
+        return TriggerAnswer(self._server, False, why)
 
     def is_answered(self) -> bool:
         """Send the request once the service is there; return whether the answer has come."""
         if self._future is None and self._client.service_is_ready():
-            self._future = self._client.call_async(self._kind.Request())
+            self._future = self._client.call_async(Trigger.Request())
         return self._future is not None and bool(self._future.done())
 
 

@@ -34,6 +34,12 @@ FILE_CHOICES = (
     "--log-file-name",
 )
 
+REFUSED = (
+    "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
+    "allow it by `ulimit -r {priority}`, `LimitRTPRIO={priority}` in its systemd unit or the "
+    "capability CAP_SYS_NICE, or set 0. The gate runs without it."
+)
+
 Forwarder = subprocess.Popen[bytes]
 _forwarders: list[Forwarder] = []  # of this process
 
@@ -258,3 +264,24 @@ def end_at_once() -> Iterator[None]:
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
+
+
+def take_priority(priority: int) -> str:
+    """Give all present threads SCHED_FIFO, unless 0; return reason and fix if refused, or ""."""
+    if priority == 0:
+        return ""
+    try:
+        for thread in ("0", *os.listdir("/proc/self/task")):
+            with contextlib.suppress(
+                ProcessLookupError
+            ):  # the thread has ended meanwhile
+                # the writers of black boxes run at ordinary priority
+                policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+                os.sched_setscheduler(int(thread), policy, os.sched_param(priority))
+    except (
+        OSError,
+        AttributeError,
+    ) as error:  # AttributeError: the system has no scheduler calls
+        reason = str(getattr(error, "strerror", None) or "it has none").lower()
+        return REFUSED.format(priority=priority, error=reason)
+    return ""

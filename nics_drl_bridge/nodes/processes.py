@@ -5,6 +5,7 @@ import random
 import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.config import PACKAGE
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.listener import GREATEST_DOMAIN_ID, Listener, holds
+from nics_drl_bridge.nodes.listener import (
+    GREATEST_DOMAIN_ID,
+    Listener,
+    ask,
+    holds,
+)
 from nics_drl_bridge.nodes.node_process import ChildProcess, make_command
 from nics_drl_bridge.nodes.operator import Call, TriggerAnswer, ask_until_granted
 from nics_drl_bridge.nodes.starting import NodeStart
@@ -139,17 +145,14 @@ class Witness(AbstractContextManager["Witness", None]):
 
     def touched(self, simulator: str, timeout_s: float) -> bool:
         """True if the simulated robot touched something in this episode. Raises BackendError."""
-        deadline = time.monotonic() + timeout_s
-        while True:
-            call = Call(self._node, simulator, "self_test", SelfTest)
-            try:
-                response = call.wait_for_response(REPLY_S)
-            except BackendError as error:
-                if time.monotonic() > deadline:
-                    reason = f"the episode can't be judged: {error}."
-                    raise BackendError(reason) from None
-            else:
-                return not any(response.passed)
+        client = self._node.create_client(SelfTest, f"{simulator}/self_test")
+        wait = partial(holds, poll_s=POLL_S)
+        response = ask(client, SelfTest.Request(), timeout_s, wait, REPLY_S)
+        self._node.destroy_client(client)
+        if response is None:
+            reason = f"{simulator} did not answer within {timeout_s:g} s"
+            raise BackendError(f"the episode can't be judged: {reason}.")
+        return not any(response.passed)
 
     def __exit__(self, *_: object) -> None:
         self._node.close()

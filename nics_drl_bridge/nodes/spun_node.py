@@ -1,24 +1,29 @@
 """A node that its owner spins."""
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from nics_drl_bridge.nodes.listener import open_context
+from nics_drl_bridge.nodes.listener import ask, open_context
 
 
 class SpunNode:
-    """A node with an executor of its own, and a context of its own unless one is given."""
+    """A node with an executor and a context of its own."""
 
     def __init__(
-        self, name: str, domain_id: int | None = None, context: Context | None = None
+        self, name: str, domain_id: int | None = None, namespace: str = ""
     ) -> None:
-        self._context = context or open_context(domain_id=domain_id)
-        self.node = Node(name, context=self._context, start_parameter_services=False)
+        self._context = open_context(domain_id=domain_id)
+        self.node = Node(
+            name,
+            context=self._context,
+            namespace=namespace,
+            start_parameter_services=False,
+        )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._clients: dict[str, Any] = {}
@@ -37,17 +42,21 @@ class SpunNode:
         return True
 
     def call_service(
-        self, kind: Any, name: str, patience_s: float, request: Any = None
+        self,
+        kind: Any,
+        name: str,
+        patience_s: float,
+        request: Any = None,
+        again_s: float = math.inf,
     ) -> Any:
-        """Return the answer of a service. Raises TimeoutError."""
+        """Return the answer of a service, asked again at a period. Raises TimeoutError."""
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
-        client = self._clients[name]
-        ready = self.until(client.service_is_ready, patience_s)
-        future = client.call_async(kind.Request() if request is None else request)
-        if not (ready and self.until(future.done, patience_s)):
+        asked = kind.Request() if request is None else request
+        answer = ask(self._clients[name], asked, patience_s, self.until, again_s)
+        if answer is None:
             raise TimeoutError(f"service {name}: no answer within {patience_s:g} s")
-        return future.result()
+        return answer
 
     def close(self) -> None:
         """End the node."""

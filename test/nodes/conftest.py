@@ -1,6 +1,8 @@
 import itertools
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,19 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.generator import SimulatorModel, builtin_model, save_model
 
 LOG_CHARACTERS = 2000
+NEEDS_ROS = re.compile(r"^pytestmark = .*mark\.ros", re.MULTILINE)
 # Nodes are started with `cmd_vel` as a Twist, whatever the distribution, unless a test asks for
 # the other type or for the default: `test_stamped_commands.py` is about these.
 LAUNCHED: list[Any] = []
 """The nodes of the running test, and of the others of its module."""
+
+
+def pytest_ignore_collect(collection_path: Path) -> bool | None:
+    """Without ROS 2, leave out the files whose tests need it."""
+    if find_spec("rclpy") is not None or collection_path.suffix != ".py":
+        return None
+    needs_ros = NEEDS_ROS.search(collection_path.read_text(encoding="utf-8"))
+    return True if needs_ros else None
 
 
 @pytest.hookimpl(wrapper=True)
@@ -32,7 +43,7 @@ def pytest_runtest_makereport() -> Iterator[None]:
     return report
 
 
-# Modules below import rclpy, so the fixtures import them: without ROS 2 every test here skips.
+# Modules below import rclpy, so the fixtures import them.
 
 
 @pytest.fixture(scope="session")
@@ -116,6 +127,15 @@ def direct(
         return Direct(node)
 
     return make
+
+
+@pytest.fixture
+def logged() -> list[str]:
+    """The lines that nodes log in the thread of the test."""
+    from nodes.in_process import LINES
+
+    LINES["MainThread"].clear()
+    return LINES["MainThread"]
 
 
 @pytest.fixture

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import signal
+import sys
 import threading
+import time
 from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from functools import partialmethod
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from rclpy.impl import rcutils_logger
-
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.nodes import runner
 from nics_drl_bridge.nodes.listener import open_context
+from nics_drl_bridge.nodes.qos import BridgeNode
 from nics_drl_bridge.nodes.record_node import RecordNode
 
 ENDS_S = 30.0
@@ -25,20 +28,46 @@ MODULES = {
 }
 LINES: defaultdict[str, list[str]] = defaultdict(list)
 """What has been logged in each thread, by its name."""
-log_in_rclpy = rcutils_logger.RcutilsLogger.log
 
 
-def keep_line(logger: Any, message: str, *given: Any, **options: Any) -> bool:
-    """Log as rclpy does, and keep the line unless it is throttled."""
-    is_logged = log_in_rclpy(logger, message, *given, **options)
-    if is_logged:
-        LINES[threading.current_thread().name].append(str(message))
-    return is_logged
+class KeptLogger:
+    """A node's logger that keeps its lines; equal lines are throttled, wherever they come from."""
+
+    def __init__(self) -> None:
+        self._logged_s: dict[str, float] = {}
+
+    def _keep(
+        self,
+        level: str,
+        line: str,
+        once: bool = False,
+        throttle_duration_sec: float = 0.0,
+    ) -> None:
+        now = time.monotonic()
+        least_s = math.inf if once else throttle_duration_sec
+        if now - self._logged_s.get(line, -math.inf) < least_s:
+            return
+        self._logged_s[line] = now
+        LINES[threading.current_thread().name].append(line)
+        print(f"[{level}] {line}", file=sys.stderr)
+
+    info = partialmethod(_keep, "INFO")
+    warning = partialmethod(_keep, "WARN")
+    error = partialmethod(_keep, "ERROR")
+
+    def debug(self, *_: Any, **__: Any) -> None:
+        """Say nothing, as by default."""
+
+    def get_child(self, _: str) -> KeptLogger:
+        return self
 
 
-rcutils_logger.RcutilsLogger.log = keep_line
-# rclpy throttles by the caller, which it looks for outside of these files
-rcutils_logger._internal_callers.append(__file__)
+def get_kept_logger(node: BridgeNode) -> KeptLogger:
+    logger: KeptLogger = vars(node).setdefault("kept_logger", KeptLogger())
+    return logger
+
+
+BridgeNode.get_logger = get_kept_logger
 
 
 class NodeThread(AbstractContextManager["NodeThread", None]):

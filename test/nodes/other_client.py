@@ -6,19 +6,9 @@ It prints what it read before it drove and after: beams of the scan, and the ran
 import json
 import os
 import sys
-import tempfile
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
-DEFINITIONS = {
-    "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec\n",
-    "std_msgs/msg/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
-    "sensor_msgs/msg/LaserScan": "std_msgs/Header header\n"
-    "float32 angle_min\nfloat32 angle_max\nfloat32 angle_increment\nfloat32 time_increment\n"
-    "float32 scan_time\nfloat32 range_min\nfloat32 range_max\n"
-    "float32[] ranges\nfloat32[] intensities\n",
-}
 PATIENCE_S = 20.0
 SPEED = 0.3
 NEARER_M = 0.5
@@ -60,28 +50,6 @@ def rosless(domain: int) -> None:
             lambda: scans.read(timeout=PATIENCE_S).ranges,
             lambda: commands.send({"linear": {"x": SPEED}}),
         )
-
-
-def roswell(domain: int) -> None:
-    import roswell as library
-
-    with tempfile.TemporaryDirectory() as folder:
-        for name, text in DEFINITIONS.items():
-            file = Path(folder) / f"{name}.msg"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(text)
-        node = library.Node("other_client", domain=domain, type_paths=[folder])
-        scan = node.load_type("sensor_msgs/msg/LaserScan")
-    best = library.QosProfile(reliability="best_effort", depth=1)
-    scans = node.subscribe("/scan", scan, qos=best)
-    commands = node.publisher("/cmd_vel", node.load_type("geometry_msgs/msg/Twist"))
-
-    def write():
-        message = commands.new()
-        message.linear.x = SPEED
-        commands.publish(message)
-
-    drive(lambda: list(next(iter(scans.messages(timeout=PATIENCE_S))).ranges), write)
 
 
 def cyclonedds(domain: int) -> None:
@@ -149,5 +117,5 @@ if sys.argv[1] == "cyclonedds":
 
 
 if __name__ == "__main__":
-    clients = {"rosless": rosless, "roswell": roswell, "cyclonedds": cyclonedds}
+    clients = {"rosless": rosless, "cyclonedds": cyclonedds}
     clients[sys.argv[1]](int(sys.argv[2]))

@@ -12,13 +12,11 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike
 from rcl_interfaces.srv import GetParameters
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.listener import open_context
+from nics_drl_bridge.nodes.spun_node import SpunNode
 
 DEADLINE_S = 90.0
 # Fast DDS drops an answer whose client the server has not discovered within 0.1 s.
@@ -30,34 +28,22 @@ class Peer:
     """Listens, publishes and calls services; spins in place while it waits for a condition."""
 
     def __init__(self, domain_id: int, namespace: str = "") -> None:
-        self.context = open_context(domain_id=domain_id)
-        self.node = Node(
-            f"peer_{next(NUMBERS)}",
-            namespace=namespace,
-            context=self.context,
-            start_parameter_services=False,
-        )
-        self._executor = SingleThreadedExecutor(context=self.context)
-        self._executor.add_node(self.node)
+        self._spun = SpunNode(f"peer_{next(NUMBERS)}", domain_id, namespace)
+        self.node = self._spun.node
+        self.close = self._spun.close
+
+    def within(self, seconds: float, condition: Callable[[], Any]) -> bool:
+        """Spin until a condition holds or the time is over; return whether it holds."""
+        return self._spun.until(condition, seconds)
 
     def until(
         self, condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S
     ) -> float:
         """Spin until a condition holds; return how long that took [s]."""
         began = time.monotonic()
-        while not condition():
-            assert time.monotonic() - began < deadline_s, (
-                f"not within {deadline_s} s: {what}"
-            )
-            self._executor.spin_once(timeout_sec=0.05)
+        is_met = self.within(deadline_s, condition)
+        assert is_met, f"not within {deadline_s} s: {what}"
         return time.monotonic() - began
-
-    def within(self, seconds: float, condition: Callable[[], Any]) -> bool:
-        """Spin until a condition holds or the time is over; return whether it holds."""
-        deadline = time.monotonic() + seconds
-        while not condition() and time.monotonic() < deadline:
-            self._executor.spin_once(timeout_sec=0.05)
-        return bool(condition())
 
     def another(self, messages: list[Any], what: str) -> Any:
         """Return the next message in a list that `listen` returned."""
@@ -85,32 +71,11 @@ class Peer:
         return publisher
 
     def call(
-        self,
-        kind: Any,
-        service: str,
-        request: Any = None,
-        times: int = 6,
-        each_s: float = ANSWERED_S,
+        self, kind: Any, service: str, request: Any = None, again_s: float = ANSWERED_S
     ) -> Any:
         """Return the answer of a service; ask again if none comes."""
-        client = self.node.create_client(kind, service)
-        self.until(client.service_is_ready, f"the service {service}")
-        futures: list[Any] = []
-
-        def answered() -> list[Any]:
-            return [future.result() for future in futures if future.done()]
-
-        for _ in range(times):
-            futures.append(
-                client.call_async(kind.Request() if request is None else request)
-            )
-            if self.within(each_s, answered):
-                break
-        assert answered(), (
-            f"not within {times} times {each_s} s: an answer of {service}"
-        )
-        self.node.destroy_client(client)
-        return answered()[0]
+        asked = kind.Request() if request is None else request
+        return self._spun.call_service(kind, service, DEADLINE_S, asked, again_s)
 
     def read_episode(self, simulator: str = "simulator_node") -> dict[str, str]:
         """Return the facts of a simulator about the present episode."""
@@ -123,11 +88,6 @@ class Peer:
         Subscriptions are announced in order, and that of the answer comes last.
         """
         self.call(GetParameters, f"{node}/get_parameters")
-
-    def close(self) -> None:
-        self._executor.shutdown(timeout_sec=1.0)
-        self.node.destroy_node()
-        self.context.try_shutdown()
 
 
 def stamp_ns(message: Any) -> int:
@@ -145,6 +105,14 @@ def odometry(
     """Return the odometry of a robot, by default at rest at its origin."""
     frames = ("odom", "base_link")
     return conversions.odometry_to_ros(pose, twist, stamp, frames, (1e-4,) * 4)
+
+
+def scan(
+    lidar: LidarSpec, stamp: int, ranges: ArrayLike = 2.0, beams: int | None = None
+) -> LaserScan:
+    """Return a scan of a lidar [m], by default of a round room."""
+    seen = np.full(beams or lidar.beams, ranges, np.float32)
+    return conversions.scan_to_ros(lidar, seen, stamp, "laser")
 
 
 class PlayedRobot:
@@ -170,9 +138,7 @@ class PlayedRobot:
         stamp = next(self._stamps) if stamp is None else stamp
         self._odom.publish(odometry(stamp, pose, twist))
         if scans:
-            ranges = np.full(self._lidar.beams, 2.0, np.float32)
-            scan = conversions.scan_to_ros(self._lidar, ranges, stamp, "laser")
-            self._scan.publish(scan)
+            self._scan.publish(scan(self._lidar, stamp))
         self._pose.publish(conversions.pose_to_ros(pose, stamp, "map"))
         return stamp
 

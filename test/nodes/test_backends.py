@@ -1,24 +1,31 @@
 import gc
 from contextlib import closing
 from functools import partial
+from unittest.mock import Mock
 
+import gymnasium
 import numpy as np
 import pytest
-
-from nics_drl_bridge.interface import NS_PER_S
-
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from geometry_msgs.msg import Twist
 from rclpy.task import Future
 from std_srvs.srv import SetBool
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.errors import BackendError, ConfigError, ModelError, StaleDataError
+from nics_drl_bridge.errors import (
+    BackendError,
+    ConfigError,
+    ModelError,
+    StaleDataError,
+)
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.interface import Start
+from nics_drl_bridge.interface import NS_PER_S, Start
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.backends import DdsBackend, dds_backend, stack_facts
+from nics_drl_bridge.nodes.backends import (
+    DdsBackend,
+    FleetBackend,
+    dds_backend,
+    stack_facts,
+)
 from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.world import load_world
 from nodes.peer import drive_alike
@@ -40,35 +47,24 @@ def arena():
 
 @pytest.fixture(scope="module")
 def simulator(launch, module_domain_id):
-    """The domain of a simulator in lock-step, and its process."""
+    """The domain of a simulator in lock-step."""
     process = launch("simulator_node", module_domain_id, mode="lockstep")
-    yield module_domain_id, process
+    yield module_domain_id
     process.check()
 
 
-@pytest.fixture
-def connect(simulator, model, arena):
-    """Make backends on that simulator; all are closed with the test."""
-    made = []
-
-    def make(**options):
-        options = {"domain_id": simulator[0], "timeout_s": TIMEOUT_S} | options
-        made.append(
-            DdsBackend(
-                options.pop("model", model), options.pop("world", arena), **options
-            )
-        )
-        return made[-1]
-
-    yield make
-    for backend in made:
-        backend.close()
+@pytest.fixture(scope="module")
+def backend(simulator, model, arena):
+    """A backend on that simulator, for all tests that do not end it."""
+    options = {"domain_id": simulator, "timeout_s": TIMEOUT_S, "truth": True}
+    with closing(DdsBackend(model, arena, **options)) as made:
+        yield made
 
 
 @pytest.fixture(scope="module")
 def commands_heard(simulator, meet):
     """Speed of each command that reaches somebody else than the simulator."""
-    peer = meet(simulator[0])
+    peer = meet(simulator)
     return peer, peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND)
 
 
@@ -121,8 +117,42 @@ def test_an_env_over_dds_tells_what_one_in_process_does_bit_for_bit(
         drive_alike(here, there, (0, 1, 2, 2, 2**31 - 1))
 
 
-def test_each_view_is_of_the_step_and_one_control_period_after_the_last(connect, model):
-    backend = connect()
+# First of all, because later the backend of the other tests speaks to the same simulator.
+@pytest.mark.parametrize("end", ["error", "close", "garbage"])
+def test_the_end_of_an_env_leaves_a_zero_command_behind(
+    simulator, model, arena, commands_heard, end
+):
+    env = BridgeEnv("dds", model, arena, backend_options={"domain_id": simulator})
+    env.myself = env  # a cycle, which only the collector ends
+    env.reset(seed=3)
+
+    def act():
+        nonlocal env
+        if end == "error":
+            with pytest.raises(gymnasium.error.InvalidAction):
+                env.step(np.full(2, np.nan, np.float32))
+        elif end == "close":
+            env.close()
+            env.close()  # twice does no harm
+        else:
+            env = None
+            gc.collect()
+
+    try:
+        zero_follows(
+            commands_heard, lambda: env.step(np.array([1.0, 0.0], np.float32)), act
+        )
+    finally:
+        if env is not None:
+            env.close()
+    if end == "close":
+        with pytest.raises(BackendError, match="closed"):
+            env._backend.step(np.zeros(2))
+        with pytest.raises(BackendError, match="closed"):
+            env._backend.reset(START)
+
+
+def test_each_view_is_of_the_step_and_one_control_period_after_the_last(backend, model):
     assert backend.reset(START).pose == pytest.approx(START.pose)
     stamps = []
     for _ in range(5):
@@ -136,11 +166,10 @@ def test_each_view_is_of_the_step_and_one_control_period_after_the_last(connect,
     drive(backend)
 
 
-@pytest.mark.parametrize("lost", [["odom"], ["scan"], ["scan", "request"]])
+@pytest.mark.parametrize("lost", [["odom"], ["scan", "request"]])
 def test_what_is_lost_on_the_way_is_requested_again_and_counts_once(
-    connect, monkeypatch, lost
+    backend, monkeypatch, lost
 ):
-    backend = connect()
     drive(backend)
     whole = backend.step(np.array([0.5, 0.1]))
     drive(backend)
@@ -172,9 +201,8 @@ def test_what_is_lost_on_the_way_is_requested_again_and_counts_once(
 
 @pytest.mark.parametrize("topic", ["odom", "scan", "ground_truth"])
 def test_a_message_that_cant_be_read_is_told_with_its_topic(
-    connect, monkeypatch, topic
+    backend, monkeypatch, topic
 ):
-    backend = connect(truth=True)
     drive(backend)
     put = backend._inbox.put
     monkeypatch.setattr(
@@ -182,8 +210,37 @@ def test_a_message_that_cant_be_read_is_told_with_its_topic(
     )
     with pytest.raises(BackendError, match=f"topic '{topic}': a message can't be read"):
         backend.step(np.array([0.5, 0.1]))
-    monkeypatch.undo()
-    drive(backend)
+
+
+def test_an_answer_that_the_simulator_could_not_deliver_is_asked_for_again(
+    backend, monkeypatch
+):
+    monkeypatch.setattr("nics_drl_bridge.nodes.link.LOST_S", 0.1)
+    test = backend._episodes._test
+    call = test.call_async
+    asked = []
+
+    def lose_every_other(request):
+        asked.append(request)
+        return Future() if len(asked) % 2 else call(request)
+
+    monkeypatch.setattr(test, "call_async", lose_every_other)
+    assert backend.reset(START).pose == pytest.approx(START.pose)
+    assert len(asked) >= 4  # before and after the reset, which must happen only once
+
+
+@pytest.mark.parametrize("end", ["halt", "close"])
+def test_one_robot_of_a_fleet_that_cant_be_halted_keeps_none_of_the_others_moving(end):
+    fleet = FleetBackend.__new__(FleetBackend)
+    fleet._robots = [
+        Mock(),
+        Mock(**{f"{end}.side_effect": BackendError("deaf")}),
+        Mock(),
+    ]
+    with pytest.raises(BackendError, match="deaf"):
+        getattr(fleet, end)()
+    for robot in fleet._robots:
+        getattr(robot, end).assert_called_once_with()
 
 
 def test_facts_of_a_fleet_are_stacked_except_the_time_that_all_share():
@@ -196,10 +253,7 @@ def test_facts_of_a_fleet_are_stacked_except_the_time_that_all_share():
     ]
 
 
-def test_after_a_failed_step_a_command_asks_for_a_reset(connect, monkeypatch):
-    backend = connect()
-    with pytest.raises(BackendError, match=r"no episode has begun; call reset\(\)"):
-        backend.send(np.zeros(2))
+def test_after_a_failed_step_a_command_asks_for_a_reset(backend, monkeypatch):
     drive(backend)
     with monkeypatch.context() as patch:
         patch.setattr(backend._inbox, "put", lambda *_: None)
@@ -211,16 +265,19 @@ def test_after_a_failed_step_a_command_asks_for_a_reset(connect, monkeypatch):
     drive(backend)
 
 
-def test_a_simulator_of_another_model_world_or_randomisation_is_refused(connect, arena):
-    for wrong, other in (
-        ("model", builtin_model("differential")),
-        ("world", arena.model_copy(update={"size": (6.0, 6.5)})),  # of the same name
-        ("randomisation", load_randomisation("mild")),
-    ):
-        backend = connect(**{wrong: other})
-        with pytest.raises(ModelError, match=f"'{other.fingerprint}'.*same {wrong}"):
-            backend.reset(START)
-        backend.close()
+@pytest.mark.parametrize("wrong", ["model", "world", "randomisation"])
+def test_a_simulator_of_another_model_world_or_randomisation_is_refused(
+    backend, arena, monkeypatch, wrong
+):
+    others = {
+        "model": builtin_model("differential"),
+        "world": arena.model_copy(update={"size": (6.0, 6.5)}),  # of the same name
+        "randomisation": load_randomisation("mild"),
+    }
+    other = others[wrong].fingerprint
+    monkeypatch.setitem(backend._episodes._identity, wrong, other)
+    with pytest.raises(ModelError, match=f"'{other}'.*same {wrong}"):
+        backend.reset(START)
 
 
 def test_without_a_simulator_the_error_names_all_that_is_missing(
@@ -233,37 +290,10 @@ def test_without_a_simulator_the_error_names_all_that_is_missing(
     assert "ground_truth" not in str(caught.value)
 
 
-@pytest.mark.parametrize("end", ["close", "garbage"])
-def test_the_end_of_an_env_leaves_a_zero_command_behind(
-    simulator, model, arena, commands_heard, end
-):
-    env = BridgeEnv("dds", model, arena, backend_options={"domain_id": simulator[0]})
-    env.myself = env  # a cycle, which only the collector ends
-    env.reset(seed=3)
-    backend = env._backend if end == "close" else None
-
-    def act():
-        nonlocal env
-        if backend is not None:
-            env.close()
-            env.close()  # twice does no harm
-        del env
-        gc.collect()
-
-    zero_follows(
-        commands_heard, lambda: env.step(np.array([1.0, 0.0], np.float32)), act
-    )
-    for use in (lambda: backend.step(np.zeros(2)), lambda: backend.reset(START)):
-        if backend is not None:
-            with pytest.raises(BackendError, match="closed"):
-                use()
-
-
 def test_somebody_else_who_moves_the_simulator_is_found_out(
-    connect, commands_heard, monkeypatch
+    backend, commands_heard, monkeypatch
 ):
     peer, _ = commands_heard
-    backend = connect()
     drive(backend)
     intruder = peer.speak(
         Twist, "cmd_vel", subscribers=2

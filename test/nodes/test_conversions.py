@@ -2,12 +2,9 @@ import math
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from hypothesis import given
 from hypothesis import strategies as st
-
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message, serialize_message
 

@@ -1,18 +1,13 @@
-"""Every signal that would end a node's process lets it leave a zero command behind."""
+"""Every signal that would end a node's process ends it in order (the gate: `test_output.py`)."""
 
 import os
 import signal
 import subprocess
 import sys
-from contextlib import closing
 
-import numpy as np
 import pytest
 
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from nics_drl_bridge.nodes import own_process
-from nics_drl_bridge.nodes.faulty_robot import Robot
 
 pytestmark = [pytest.mark.ros, pytest.mark.process]
 
@@ -94,35 +89,3 @@ def test_a_lost_terminal_does_not_end_what_was_started_by_nohup():
         assert signal.SIGHUP not in own_process.list_ending_signals()
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-@pytest.mark.campaign
-def test_a_node_below_nohup_goes_on_without_its_terminal(domain_id):
-    process = subprocess.Popen(
-        [sys.executable, "-c", NODE],
-        env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
-        stdout=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
-    )
-    assert process.stdout.readline() == "runs\n"
-    process.send_signal(signal.SIGHUP)
-    assert [process.stdout.readline() for _ in range(5)] == ["runs\n"] * 5
-    process.send_signal(signal.SIGTERM)
-    assert "stopped\n" in process.communicate(timeout=DEADLINE_S)[0]
-
-
-@pytest.mark.parametrize("number", [signal.SIGHUP, rarely(signal.SIGQUIT)])
-def test_a_gate_that_lets_a_robot_drive_leaves_a_zero_behind(
-    launch_process, domain_id, model, tmp_path, number
-):
-    if signal.getsignal(number) is signal.SIG_IGN:
-        pytest.skip("the shell that started the tests ignores it")
-    given = {"limits": "ackermann", "black_box": str(tmp_path), "stop_when_held": False}
-    gate = launch_process("command_gate", domain_id, **given)
-    with closing(Robot(domain_id, model, np.array([0.5, 0.0, 0.0]))) as robot:
-        robot.drive()
-        gate._process.send_signal(number)
-        assert robot.until(lambda: gate.poll() is not None, DEADLINE_S)
-        assert gate.poll() == 0
-        assert robot.until(lambda: not robot.moves, 5.0)

@@ -9,8 +9,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from nics_drl_bridge.nodes import faulty_robot, gate_faults
 from nics_drl_bridge.nodes.faulty_robot import Robot
 
@@ -18,19 +16,15 @@ pytestmark = pytest.mark.ros
 
 
 def test_the_base_ends_with_the_process_that_started_it(monkeypatch):
-    executor = Mock()
-    executor.spin_once.side_effect = [None, None]  # not more often
+    base = Mock()
+    base.spin.side_effect = [None, None]  # not more often
     parent = Mock()
     parent.is_alive.side_effect = [True, True, False]
     monkeypatch.setattr(multiprocessing, "parent_process", lambda: parent)
-    monkeypatch.setattr(faulty_robot, "open_driver_context", Mock())
-    monkeypatch.setattr(faulty_robot, "Node", Mock())
-    monkeypatch.setattr(
-        faulty_robot, "SingleThreadedExecutor", Mock(return_value=executor)
-    )
+    monkeypatch.setattr(faulty_robot, "SpunNode", lambda *_: base)
     faulty_robot.hear(None, Mock())
-    for call in executor.spin_once.call_args_list:
-        assert call.kwargs["timeout_sec"] <= 1.0
+    for call in base.spin.call_args_list:
+        assert call.kwargs["timeout_s"] <= 1.0
 
 
 def test_a_command_that_a_frozen_gate_had_written_before_does_not_count(monkeypatch):

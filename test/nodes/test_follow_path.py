@@ -1,282 +1,320 @@
+"""Nav2's actions without its messages; the campaign `nav2_standards` has them, over DDS."""
+
 import math
 import tarfile
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-pytest.importorskip("nav2_msgs", reason="nav2_msgs is not installed")
-
-from geometry_msgs.msg import (
-    PoseStamped,
-    PoseWithCovarianceStamped,
-    Twist,
-    TwistStamped,
-)
-from nav2_msgs.action import FollowPath, NavigateToPose
-from nav2_msgs.msg import SpeedLimit
-from nav_msgs.msg import Odometry, Path
-from rclpy.action import ActionClient, ActionServer
-from rclpy.node import NodeNameNonExistentError
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path
+from rclpy.node import Node, NodeNameNonExistentError
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
 from test_packaging import ROOT
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.nav2 import follow_path
 from nics_drl_bridge.extras.nav2.follow_path import FOLLOW, NAVIGATE, PathActions
-from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.nodes import conversions, policy_node, qos
+from nics_drl_bridge.lidar.maps import GridMap
+from nics_drl_bridge.nodes import conversions, policy_node
+from nics_drl_bridge.nodes.parts import Wish
 from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nics_drl_bridge.nodes.runner import explain_ignored_values
-from nodes.peer import pose_of
+from nodes.direct import Clock
+from nodes.peer import odometry, scan
 
 pytestmark = pytest.mark.ros
-SUCCEEDED = 4
-CANCELED = 5
-ABORTED = 6
 ARCHIVE = ROOT.parent / "shared" / "upstream" / "nav2_interfaces.tar.gz"
-CODES = FollowPath.Result
 CONTROLLER = ("-r", "__node:=controller_server")
+FIND = conversions.find_message_type
 
 
-class Tree:
-    """The test's end of the actions, which relays the commands to a simulator in lock-step."""
+class Fields:
+    """A message of some fields."""
 
-    def __init__(self, peer):
-        self.peer = peer
-        self.feedback = []
-        self.truths = peer.listen(Odometry, "ground_truth")
-        self.raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
-        self.commands = peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
-        peer.node.create_subscription(
-            TwistStamped,
-            "cmd_vel_raw",
-            lambda m: self.commands.publish(m.twist),
-            qos.EVERY_COMMAND,
+    def __init__(self, *names):
+        self.names = names
+
+    def get_fields_and_field_types(self):
+        return dict.fromkeys(self.names)
+
+
+class Kind:
+    """An action like those of Nav2, whose codes are their own names."""
+
+    class Result:
+        error_code = error_msg = ""
+
+    @staticmethod
+    def Feedback():  # noqa: N802 - as in the standard
+        made = Fields("distance_remaining", "tracking_feedback")
+        made.tracking_feedback = Fields(
+            "distance_to_goal", "speed", "remaining_path_length", "robot_pose"
         )
-        self.clients = {
-            kind: ActionClient(peer.node, kind, name)
-            for kind, name in (
-                (FollowPath, "follow_path"),
-                (NavigateToPose, "navigate_to_pose"),
-            )
-        }
+        return made
 
-    @property
-    def pose(self):
-        return pose_of(self.truths[-1])
 
-    def until(self, done, what):
-        """Waits; a command of zero makes up for a message that was lost."""
-        for _ in range(40):
-            if self.peer.within(3.0, done):
-                return
-            self.commands.publish(Twist())
-        raise AssertionError(f"never: {what}")
+CODES = (
+    "NONE",
+    "UNKNOWN",
+    "INVALID_PATH",
+    "TF_ERROR",
+    "INVALID_CONTROLLER",
+    "FAILED_TO_MAKE_PROGRESS",
+    "CONTROLLER_TIMED_OUT",
+    "PATIENCE_EXCEEDED",
+    "FAILED_TO_LOAD_BEHAVIOR_TREE",
+)
+for code in CODES:
+    setattr(Kind.Result, code, code)
 
-    def tells_where_it_is(self):
-        """Lets the policy know the robot's true pose: odometry has drifted over all the drives."""
-        message = PoseWithCovarianceStamped()
-        told = "the robot is at"
-        message.header.frame_id = "map"
-        message.pose.pose = conversions.pose_to_ros(self.pose, 0, "map").pose
-        known = self.policy.log.read_text().count(told)
-        self.poses.publish(message)
-        self.until(
-            lambda: self.policy.log.read_text().count(told) > known, "the pose is heard"
+
+class Goal:
+    """The handle of a goal; `ended` is how it ended, with its code and sentence."""
+
+    def __init__(self, **request):
+        self.request = SimpleNamespace(**request)
+        self.is_cancel_requested = False
+        self.told = []
+        self.publish_feedback = self.told.append
+        self.ended = None
+
+
+class Server:
+    """Holds goals like `HeldActionServer`."""
+
+    def __init__(self, node, kind, name, is_open, begin):
+        self.is_open = is_open
+        self.begin = begin
+        self.is_destroyed = False
+
+    def finish(self, goal, end, result):
+        goal.ended = end, result.error_code, result.error_msg
+
+    def destroy(self):
+        self.is_destroyed = True
+
+
+class Driven:
+    """A policy node that drives a robot along its commands, on a field of 8 m by 8 m."""
+
+    def __init__(self, direct):
+        given = ("rate:=0.0", "deadline:=5.0", "model:=differential")
+        self.robot = direct(*given, kind=PolicyNode)
+        self.node = self.robot.node
+        (self.actions,) = self.node._leaders
+        field = GridMap(np.zeros((80, 80), np.int8), 0.1, (-4.0, -4.0, 0.0))
+        self.robot.give("map", conversions.map_to_ros(field, 0, "map"))
+        self.pose = np.array([-2.0, -2.0, 0.0])
+        self.twist = np.zeros(3)
+        self.now_ns = 10**9
+        self.node._topics.now_ns = lambda: self.now_ns
+        self.look()
+        self.put(self.pose)
+
+    def put(self, pose):
+        """Tell where the robot is in the map."""
+        message = conversions.odometry_to_ros(
+            pose, self.twist, 0, ("map", ""), (0.0,) * 4
         )
+        placed = FIND("geometry_msgs/msg/PoseWithCovarianceStamped")()
+        placed.header.frame_id = "map"
+        placed.pose = message.pose
+        self.robot.give("initialpose", placed)
 
-    def send(self, goal):
-        kind = FollowPath if isinstance(goal, FollowPath.Goal) else NavigateToPose
-        client = self.clients[kind]
-        self.until(client.server_is_ready, "the action")
-        future = client.send_goal_async(goal, feedback_callback=self.feedback.append)
-        self.until(future.done, "an answer")
-        assert future.result().accepted
-        return future.result()
+    def look(self):
+        """Show the robot a scan; return the twist that it drives by from then on."""
+        self.now_ns += 10**8
+        self.robot.give("odom", odometry(self.now_ns, self.pose, self.twist))
+        self.robot.give("scan", scan(self.node._model.lidar, self.now_ns, 3.0))
+        self.twist = conversions.twist_from_ros(
+            self.robot.sent["cmd_vel_raw"][-1].twist
+        )
+        self.pose = geometry.compose(self.pose, geometry.exp(0.1 * self.twist))
+        return self.twist
 
-    def end(self, handle):
-        future = handle.get_result_async()
-        self.until(future.done, "a result")
-        return future.result()
+    def send(self, goal, name=FOLLOW):
+        self.actions._servers[name].begin(goal)
+        return goal
 
-    def ended(self, goal):
-        return self.end(self.send(goal))
-
-
-def path(*points, frame="map"):
-    made = Path()
-    made.header.frame_id = frame
-    made.poses = [conversions.pose_to_ros([*p, 0.0], 0, frame) for p in points]
-    return FollowPath.Goal(path=made, controller_id="FollowPath")
+    def end(self, goal, name=FOLLOW, looks=400):
+        """Drive to a goal; return how it ended."""
+        self.send(goal, name)
+        for _ in range(looks):
+            if goal.ended:
+                break
+            self.look()
+        return goal.ended
 
 
-@pytest.fixture(scope="module")
-def tree(launch, meet, module_domain_id):
-    start = {"episode_start": [-2.0, -2.0, 0.0]}
-    simulator = launch(
-        "simulator_node", module_domain_id, mode="lockstep", world="empty", **start
+@pytest.fixture
+def driven(direct, monkeypatch):
+    kinds = dict.fromkeys(follow_path.KINDS.values(), Kind)
+    kinds[follow_path.SPEED_LIMIT] = Bool
+    monkeypatch.setattr(
+        conversions, "find_message_type", lambda kind: kinds.get(kind) or FIND(kind)
     )
-    policy = launch(
-        "policy_node",
-        module_domain_id,
-        rate=0.0,
-        deadline=30.0,
-        costmap_update_timeout=60.0,
-    )
-    made = Tree(meet(module_domain_id))
-    made.goals = made.peer.speak(PoseStamped, "goal_pose")
-    made.limits = made.peer.speak(SpeedLimit, "speed_limit")
-    made.poses = made.peer.speak(PoseWithCovarianceStamped, "initialpose")
-    made.policy = policy
-    made.until(lambda: made.truths and made.raw, "the robot")
-    yield made
-    simulator.check()
-    policy.check()
+    monkeypatch.setattr(follow_path, "HeldActionServer", Server)
+    return Driven(direct)
 
 
-def test_a_path_is_followed_to_its_end_with_feedback(tree):
-    tree.feedback.clear()
-    result = tree.ended(path((-2.0, -2.0), (0.0, -2.0), (0.5, -1.5)))
-    assert (result.status, result.result.error_code) == (SUCCEEDED, CODES.NONE)
-    assert math.dist(tree.pose[:2], (0.5, -1.5)) < 0.35
-    told = [each.feedback.tracking_feedback for each in tree.feedback]
+def follow(*points, frame="map", **names):
+    path = Path()
+    path.header.frame_id = frame
+    path.poses = [conversions.pose_to_ros([*p, 0.0], 0, frame) for p in points]
+    return Goal(path=path, **{"controller_id": "FollowPath"} | names)
+
+
+def navigate(x, y, tree=""):
+    pose = conversions.pose_to_ros([x, y, 0.0], 0, "map")
+    return Goal(pose=pose, behavior_tree=tree)
+
+
+def test_a_path_is_followed_to_its_end_with_feedback(driven):
+    goal = follow((-2.0, -2.0), (0.0, -2.0), (0.5, -1.5))
+    assert driven.end(goal) == ("succeed", "NONE", "")
+    assert math.dist(driven.pose[:2], (0.5, -1.5)) < 0.35
+    told = [each.tracking_feedback for each in goal.told]
     assert told[0].distance_to_goal > 2.0 > 0.5 > told[-1].distance_to_goal
     assert told[0].remaining_path_length > told[-1].remaining_path_length
     assert max(each.speed for each in told) > 0.1
     assert told[-1].robot_pose.header.frame_id == "map"
-    assert np.abs([each.position_tracking_error for each in told]).max() < 0.5
-    tree.until(lambda: tree.raw[-1].twist == Twist(), "rest")
+    assert driven.look().tolist() == [0.0, 0.0, 0.0]
 
 
-def by(**names):
-    return FollowPath.Goal(path=path((0.0, 0.0)).path, **names)
-
-
-REFUSED = [
-    (path(), CODES.INVALID_PATH, "the path is empty"),
-    (path((math.nan, 0.0)), CODES.INVALID_PATH, "not a number"),
-    (
-        path((0.0, 0.0), (9.0, 0.0)),
-        CODES.INVALID_PATH,
-        "(9.00, 0.00) m, is off the map",
-    ),
-    (
-        path((0.0, 0.0), frame="kitchen"),
-        CODES.TF_ERROR,
-        "'kitchen' is refused: the frame is not known",
-    ),
-    (
-        by(controller_id="DWB"),
-        CODES.INVALID_CONTROLLER,
-        "'DWB'; name one of 'FollowPath'",
-    ),
-    (by(goal_checker_id="exact"), CODES.UNKNOWN, "no goal checker 'exact'"),
-    (by(path_handler_id="exact"), CODES.UNKNOWN, "no path handler 'exact'"),
-    (path((1e5, 0.0), frame="base_link"), CODES.INVALID_PATH, "pose 0 of the path"),
-]
-
-
-@pytest.mark.parametrize(("goal", "code", "sentence"), REFUSED)
+@pytest.mark.parametrize(
+    ("goal", "code", "sentence"),
+    [
+        (follow(), "INVALID_PATH", "the path is empty"),
+        (follow((math.nan, 0.0)), "INVALID_PATH", "not a number"),
+        (follow((0.0, 0.0), (9.0, 0.0)), "INVALID_PATH", "(9.00, 0.00) m, is off the"),
+        (follow((0.0, 0.0), frame="kitchen"), "TF_ERROR", "the frame is not known"),
+        (
+            follow((0.0, 0.0), controller_id="DWB"),
+            "INVALID_CONTROLLER",
+            "'DWB'; name one of 'FollowPath'",
+        ),
+        (follow((0.0, 0.0), goal_checker_id="x"), "UNKNOWN", "no goal checker 'x'"),
+        (follow((0.0, 0.0), path_handler_id="x"), "UNKNOWN", "no path handler 'x'"),
+        (follow((1e5, 0.0), frame="base_link"), "INVALID_PATH", "pose 0 of the path"),
+    ],
+)
 def test_a_path_that_can_not_be_followed_ends_with_the_standards_code_and_a_sentence(
-    tree, goal, code, sentence
+    driven, goal, code, sentence
 ):
-    result = tree.ended(goal)
-    assert (result.status, result.result.error_code) == (ABORTED, code)
-    assert sentence in result.result.error_msg
-    assert result.result.error_msg.startswith("follow_path: ")
+    end, *told = driven.send(goal).ended
+    assert (end, told[0]) == ("abort", code)
+    assert sentence in told[1]
+    assert told[1].startswith("follow_path: ")
 
 
-def test_a_path_ahead_of_the_robot_is_where_it_looks(tree):
-    before = tree.pose
-    result = tree.ended(path((0.0, 0.0), (0.8, 0.0), frame="base_link"))
-    assert result.status == SUCCEEDED
-    ahead = before[:2] + 0.8 * np.array([math.cos(before[2]), math.sin(before[2])])
-    assert math.dist(tree.pose[:2], ahead) < 0.4
+def test_a_path_ahead_of_the_robot_is_where_it_looks(driven):
+    assert driven.end(follow((0.0, 0.0), (0.8, 0.0), frame="base_link"))[0] == "succeed"
+    assert math.dist(driven.pose[:2], (-1.2, -2.0)) < 0.4
 
 
-def test_a_cancelled_path_stops_the_robot(tree):
-    handle = tree.send(path(tree.pose[:2].tolist(), (0.0, 0.0), (2.0, 2.0)))
-    tree.until(lambda: tree.raw[-1].twist.linear.x > 0.1, "driving")
-    future = handle.cancel_goal_async()
-    tree.until(future.done, "cancelling")
-    assert tree.end(handle).status == CANCELED
-    tree.until(lambda: tree.raw[-1].twist == Twist(), "rest")
+def test_a_cancelled_path_stops_the_robot(driven):
+    goal = driven.send(follow((-2.0, -2.0), (2.0, -2.0)))
+    for _ in range(10):
+        driven.look()
+    assert driven.twist[0] > 0.1
+    goal.is_cancel_requested = True
+    assert driven.look().tolist() == [0.0, 0.0, 0.0]
+    assert goal.ended == ("canceled", "NONE", "")
 
 
-def test_a_newer_path_takes_the_place_of_the_one_before_and_no_goal_pose_does(tree):
-    first = tree.send(path(tree.pose[:2].tolist(), (-2.0, 2.0)))
-    second = tree.send(path(tree.pose[:2].tolist(), (0.0, 0.5)))
-    ended = tree.end(first)
-    assert ended.status == ABORTED
-    assert "a newer goal" in ended.result.error_msg
-    tree.goals.publish(PoseStamped())
-    log = tree.policy.log
-    tree.until(lambda: "goal_pose is ignored" in log.read_text(), "a sentence")
-    assert tree.end(second).status == SUCCEEDED
+def test_a_newer_path_takes_the_place_of_the_one_before_and_no_goal_pose_does(
+    driven, logged, monkeypatch
+):
+    begun = []
+    monkeypatch.setattr(policy_node, "begin", begun.append)
+    first = driven.send(follow((-2.0, -2.0), (-2.0, 2.0)))
+    again = driven.send(follow((-2.0, -2.0), (-1.0, 0.0), (-2.0, 2.0)))
+    assert len(begun) == 1  # another way to the same goal
+    for replaced, goal in ((first, again), (again, follow((-2.0, -2.0), (-1.0, -2.0)))):
+        if goal is not again:
+            driven.send(goal)
+        assert replaced.ended[:2] == ("abort", "UNKNOWN")
+        assert "a newer goal" in replaced.ended[2]
+    assert len(begun) == 2
+    driven.robot.give("goal_pose", PoseStamped())
+    assert "a goal_pose is ignored while an action leads the robot" in logged
+    for _ in range(100):
+        driven.look()
+    assert goal.ended[0] == "succeed"
 
 
-def test_a_speed_limit_is_kept_and_a_robot_that_does_not_get_on_is_given_up(tree):
-    most = max(raw.twist.linear.x for raw in tree.raw)
-    tree.limits.publish(SpeedLimit(percentage=True, speed_limit=1.0))
-    tree.peer.within(0.5, lambda: False)
-    known = len(tree.raw)
-    handle = tree.send(path(tree.pose[:2].tolist(), (-2.0, -2.0)))
-    result = tree.end(handle)
-    assert result.result.error_code == CODES.FAILED_TO_MAKE_PROGRESS
-    fastest = max(abs(raw.twist.linear.x) for raw in tree.raw[known + 2 :])
-    assert 0.0 < fastest < 0.05 < most
-    tree.limits.publish(SpeedLimit())
+@pytest.mark.parametrize("replans", [False, True])
+def test_a_robot_that_does_not_get_on_is_given_up_although_its_path_is_planned_again(
+    driven, replans, logged
+):
+    driven.actions._take_limit(SimpleNamespace(percentage=False, speed_limit=math.nan))
+    assert "speed limit nan: must be 0, for none, or more." in logged
+    driven.actions._take_limit(SimpleNamespace(percentage=True, speed_limit=1.0))
+    speeds = []
+    goal = driven.send(follow((-2.0, -2.0), (2.0, -2.0)))
+    for k in range(120):
+        speeds.append(driven.look()[0])
+        if goal.ended:
+            break
+        if replans and k % 30 == 29:
+            goal = driven.send(follow((-2.0, -2.0), (2.0, -2.0)))
+    assert goal.ended[:2] == ("abort", "FAILED_TO_MAKE_PROGRESS")
+    assert 0.0 < max(speeds) < 0.05
 
 
-def test_a_robot_that_stands_is_given_up_although_its_path_is_planned_again(tree):
-    def now_s():
-        return conversions.stamp_from_ros(tree.truths[-1].header.stamp) / NS_PER_S
-
-    tree.limits.publish(SpeedLimit(percentage=True, speed_limit=1.0))
-    tree.peer.within(0.5, lambda: False)
-    way = path(tree.pose[:2].tolist(), (-2.0, 2.0))
-    since_s = now_s()
-    codes = []
-    while not codes and now_s() - since_s < 30.0:
-        future, sent_s = tree.send(way).get_result_async(), now_s()
-        tree.until(
-            lambda f=future, s=sent_s: f.done() or now_s() - s > 3.0, "3 s, or an end"
-        )
-        if future.done():
-            codes.append(future.result().result.error_code)
-    assert codes == [CODES.FAILED_TO_MAKE_PROGRESS]
-    tree.limits.publish(SpeedLimit())
+def test_navigate_to_pose_drives_to_a_goal_and_knows_no_trees(driven):
+    refused = driven.send(navigate(0.0, 0.0, "mine.xml"), NAVIGATE)
+    assert refused.ended[:2] == ("abort", "FAILED_TO_LOAD_BEHAVIOR_TREE")
+    goal = navigate(-0.5, -1.0)
+    assert driven.end(goal, NAVIGATE) == ("succeed", "NONE", "")
+    assert math.dist(driven.pose[:2], (-0.5, -1.0)) < 0.35
+    assert goal.told[0].distance_remaining > goal.told[-1].distance_remaining
 
 
-def test_navigate_to_pose_drives_to_a_goal_and_knows_no_trees(tree):
-    goal = NavigateToPose.Goal()
-    goal.pose.header.frame_id, goal.behavior_tree = "map", "mine.xml"
-    result = tree.ended(goal)
-    assert (
-        result.result.error_code == NavigateToPose.Result.FAILED_TO_LOAD_BEHAVIOR_TREE
+def test_navigate_to_pose_is_left_to_another_node_that_serves_it(driven, logged):
+    server = driven.actions._servers[NAVIGATE]
+    other = Node("bt_navigator", context=driven.node.context)
+    other.create_service(Trigger, "navigate_to_pose/_action/send_goal", lambda *_: _)
+    driven.actions._look()
+    assert server.is_destroyed
+    assert "another node serves navigate_to_pose, so this one no longer does" in logged
+    other.destroy_node()
+
+
+def test_a_goal_ends_when_scans_fall_silent_and_when_the_robot_touches_something(
+    driven, monkeypatch
+):
+    monkeypatch.setattr(follow_path, "time", clock := Clock())
+    silent = driven.send(follow((-2.0, -2.0), (2.0, -2.0)))
+    driven.look()
+    driven.now_ns += 5 * 10**9
+    clock.now_s += 5.0
+    driven.node._act()
+    assert silent.ended[1:] == (
+        "CONTROLLER_TIMED_OUT",
+        "nothing on scan and odom for 1 s.",
     )
-    goal.behavior_tree = ""
-    goal.pose.pose.position.x = -1.5
-    tree.feedback.clear()
-    tree.tells_where_it_is()
-    result = tree.ended(goal)
-    assert (result.status, result.result.error_code) == (SUCCEEDED, 0)
-    assert math.dist(tree.pose[:2], (-1.5, 0.0)) < 0.35
-    assert (
-        tree.feedback[0].feedback.distance_remaining
-        > tree.feedback[-1].feedback.distance_remaining
-    )
+    touching = driven.send(follow((-2.0, -2.0), (2.0, -2.0)))
+    driven.actions._drive = lambda _: Wish(np.ones(3), True)
+    assert driven.look().tolist() == [0.0, 0.0, 0.0]
+    assert touching.ended is None
+    clock.now_s += 0.5
+    driven.look()
+    assert touching.ended[:2] == ("abort", "PATIENCE_EXCEEDED")
 
 
-def test_navigate_to_pose_is_left_to_another_node_that_serves_it(tree):
-    other = ActionServer(
-        tree.peer.node, NavigateToPose, "navigate_to_pose", lambda _: None
-    )
-    log = tree.policy.log
-    tree.until(
-        lambda: "another node serves navigate_to_pose" in log.read_text(), "a sentence"
-    )
-    other.destroy()
+def test_goals_are_taken_while_the_node_is_active(driven):
+    server = driven.actions._servers[FOLLOW]
+    assert server.is_open()
+    goal = driven.send(follow((-2.0, -2.0), (2.0, -2.0)))
+    driven.node.trigger_deactivate()
+    assert not server.is_open()
+    assert goal.ended == ("abort", "UNKNOWN", "the node is deactivated.")
+    driven.node.trigger_cleanup()
+    assert server.is_destroyed
 
 
 @pytest.mark.parametrize("driven", [NAVIGATE, FOLLOW])
@@ -373,28 +411,11 @@ def test_an_empty_list_of_plugins_is_one_sentence(make_node, kind):
         make_node(f"{kind}_plugins:=[]", kind=PolicyNode)
 
 
-def test_a_policy_begins_anew_with_another_goal_and_not_with_another_way_to_it(
-    tree, monkeypatch
-):
-    begun = []
-    monkeypatch.setattr(policy_node, "begin", begun.append)
-    first = tree.send(path((-2.0, -2.0), (1.0, 1.0)))
-    second = tree.send(path((-2.0, -2.0), (-1.0, 0.0), (1.0, 1.0)))
-    assert tree.end(first).status == ABORTED
-    assert len(begun) == 1
-    third = tree.send(path((-2.0, -2.0), (1.5, 1.0)))
-    assert tree.end(second).status == ABORTED
-    assert len(begun) == 2
-    tree.until(third.cancel_goal_async().done, "it is cancelled")
-
-
 def test_results_of_distributions_without_codes_are_filled_as_far_as_they_go():
-    from nics_drl_bridge.extras.nav2.follow_path import make_result
-
     class Bare:
         class Result:
             pass
 
-    assert vars(make_result(Bare, "TF_ERROR", "why")) == {}
-    told = make_result(FollowPath, "TF_ERROR", "why")
-    assert (told.error_code, told.error_msg) == (CODES.TF_ERROR, "why")
+    assert vars(follow_path.make_result(Bare, "TF_ERROR", "why")) == {}
+    told = follow_path.make_result(Kind, "TF_ERROR", "why")
+    assert (told.error_code, told.error_msg) == ("TF_ERROR", "why")

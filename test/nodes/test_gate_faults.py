@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 from gate.assurance.samples import PROTOCOL
 
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.nodes import gate_faults

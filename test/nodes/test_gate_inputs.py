@@ -2,9 +2,6 @@
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from geometry_msgs.msg import Quaternion
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Bool
@@ -13,6 +10,8 @@ from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.gate.intake import estimate_malformed
 from nics_drl_bridge.lidar.spec import from_device, load_lidar
 from nics_drl_bridge.nodes import conversions, gate_inputs, wire
+
+pytestmark = pytest.mark.ros
 
 STAMP_NS = 1_763_000_000_123_456_789
 LIDAR = load_lidar("paper")

@@ -5,9 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from gate.rig import Rig, config
 
 from nics_drl_bridge.gate import inputs
@@ -23,6 +20,8 @@ from nics_drl_bridge.nodes.gate_log import (
     GateLog,
 )
 from nics_drl_bridge.nodes.runner import ERROR, OK, STALE, WARN
+
+pytestmark = pytest.mark.ros
 
 DEADLINE_S = 20.0
 LONG_S = 60.0

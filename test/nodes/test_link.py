@@ -1,5 +1,6 @@
-"""A link leaves nothing open, wherever the constructor of its backend fails."""
+"""A link leaves nothing open and no robot moving, whatever ends it."""
 
+import math
 import os
 import signal
 import threading
@@ -8,13 +9,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from geometry_msgs.msg import Twist
 
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.nodes import backends, link
+from nics_drl_bridge.nodes import backends, link, listener, qos
 from nics_drl_bridge.nodes.backends import DdsBackend, FleetBackend
 from nics_drl_bridge.nodes.link import Link
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
@@ -22,6 +20,7 @@ from nics_drl_bridge.sim.world import load_world
 
 pytestmark = pytest.mark.ros
 OPEN = link.open_context
+AHEAD = np.array([0.5, 0.0, 0.0])
 
 
 @pytest.fixture
@@ -129,3 +128,54 @@ def test_a_signal_that_would_end_the_program_is_an_exception(number, domain_id):
     finally:
         signal.signal(number, before)
     assert caught.value.code == 128 + number
+
+
+@pytest.fixture
+def drive(meet, domain_id):
+    """Make a robot drive that a listener has found, `drive(timeout_s)`."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    peer = meet(domain_id)
+    heard = peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND)
+    made = []
+
+    def start(timeout_s=math.inf):
+        robot = Link(domain_id=domain_id, stamped=False, command_timeout_s=timeout_s)
+        made.append(robot)
+        peer.until(lambda: robot.send(AHEAD) or heard, "a command")
+        return robot, peer, heard
+
+    yield start
+    for robot in made:
+        robot.close()
+    assert signal.signal(signal.SIGINT, before) is signal.default_int_handler
+
+
+def test_ctrl_c_between_two_steps_in_lock_step_leaves_a_zero_behind(drive):
+    _, peer, heard = drive()
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    peer.until(lambda: heard[-1] == Twist(), "a zero command")
+
+
+def test_a_command_that_no_other_one_follows_is_followed_by_a_zero(drive):
+    """Its sender may have died of an error that the env never saw."""
+    robot, peer, heard = drive(timeout_s=0.3)
+    robot.begin()
+    for _ in range(2):
+        peer.until(lambda: robot.send(AHEAD) or heard[-1] != Twist(), "it drives")
+        peer.until(lambda: heard[-1] == Twist(), "a zero command")
+
+
+def test_the_death_of_the_thread_that_listens_leaves_a_zero_behind(drive, monkeypatch):
+    def die(*_, **__):
+        raise MemoryError("in the executor")
+
+    robot, peer, heard = drive()
+    monkeypatch.setattr(threading, "excepthook", lambda *_: None)
+    monkeypatch.setattr(listener.SingleThreadedExecutor, "spin_once", die)
+    robot.begin()
+    robot._thread.join()
+    monkeypatch.undo()
+    peer.until(lambda: heard[-1] == Twist(), "a zero command")
+    with pytest.raises(BackendError, match="closed"):
+        robot.check_open()

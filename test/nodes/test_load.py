@@ -8,19 +8,14 @@ import sys
 
 import pytest
 
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from nics_drl_bridge.commands.doctor import doctor
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.nodes import load, node_process
 from nics_drl_bridge.nodes.load import read_memory_mb
 from nics_drl_bridge.nodes.processes import unused_domain_id
 
-pytestmark = [
-    pytest.mark.ros,
-    pytest.mark.process,
-    pytest.mark.skipif(sys.platform != "linux", reason="needs Linux"),
-]
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux")
+pytestmark = [pytest.mark.ros, pytest.mark.process, LINUX]
 NODES = ["middleware_node", "policy_node", "command_gate"]
 LATE_S = 0.03
 SLOW = f"""

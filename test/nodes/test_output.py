@@ -164,64 +164,43 @@ def test_the_errors_of_a_command_arrive_in_order_and_stderr_is_its_own_again():
     assert told == b"after\n"
 
 
-class TestGate:
-    """The gate in a process of its own, whose output nobody reads."""
+@pytest.mark.ros
+def test_a_gate_whose_log_nobody_reads_controls_on_and_leaves_a_zero_at_its_end(
+    domain_id, model, tmp_path
+):
+    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+    from nics_drl_bridge.nodes.faulty_robot import Robot
 
-    @pytest.fixture
-    def gate(self, domain_id, tmp_path):
-        pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-        exit_, entrance = full_pipe()
-        variables = {
-            "ROS_DOMAIN_ID": str(domain_id),
-            "ROS_LOG_DIR": str(tmp_path / "log"),
-        }
-        words = ["-p", "enable_stamped_cmd_vel:=false", "-p", f"black_box:={tmp_path}"]
-        start = [sys.executable, "-m", "nics_drl_bridge.nodes.start", "command_gate"]
-        gate = subprocess.Popen(
-            [*start, "--ros-args", *words],
-            env=os.environ | variables,
-            stdin=subprocess.DEVNULL,
-            stdout=entrance,
-            stderr=entrance,
-        )
-        os.close(entrance)
-        yield gate, exit_
-        gate.kill()
-        gate.wait()
-        os.close(exit_)
-
-    @pytest.mark.ros
-    def test_it_controls_on_and_ends_at_a_signal_though_nobody_reads_its_log(
-        self, gate, meet, domain_id, tmp_path
-    ):
-        from diagnostic_msgs.msg import DiagnosticArray
-        from geometry_msgs.msg import Twist
-        from std_msgs.msg import Bool
-
-        from nics_drl_bridge.nodes import qos
-
-        process, exit_ = gate
-        peer = meet(domain_id)
-        passed = peer.listen(Twist, "cmd_vel", qos.COMMAND)
-        said = peer.listen(DiagnosticArray, "/diagnostics")
-        button = peer.speak(Bool, "e_stop")
-        peer.until(lambda: len(passed) > 20, "more commands", 10.0)
-        assert passed == [Twist()] * len(passed)
-        button.publish(Bool(data=True))
-        peer.until(
-            lambda: (
-                peer.another(said, "diagnostics")
-                .status[0]
-                .message.startswith("e_stop_press")
-            ),
-            "the e-stop is heeded",
-            10.0,
-        )
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(10.0) == 0
-        told = read_all(exit_)
-        assert "[command_gate]: running" in told
-        assert "stopped by e_stop_pressed" in told
-        (log,) = (tmp_path / "log").iterdir()
-        assert log.name.startswith("command_gate_")
-        assert "stopped by e_stop_pressed" in log.read_text()
+    exit_, entrance = full_pipe()
+    given = ("model:=ackermann", "limits:=ackermann", "enable_stamped_cmd_vel:=false")
+    words = [*given, "stop_when_held:=false", f"black_box:={tmp_path}"]
+    command = [sys.executable, "-m", "nics_drl_bridge.nodes.start", "command_gate"]
+    gate = subprocess.Popen(
+        [*command, "--ros-args", *(part for word in words for part in ("-p", word))],
+        env=os.environ
+        | {"ROS_DOMAIN_ID": str(domain_id), "ROS_LOG_DIR": str(tmp_path / "log")},
+        stdin=subprocess.DEVNULL,
+        stdout=entrance,
+        stderr=entrance,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
+    )
+    os.close(entrance)
+    with contextlib.ExitStack() as ends:
+        ends.callback(gate.kill)
+        robot = Robot(domain_id, model, [0.5, 0.0, 0.0])
+        ends.callback(robot.close)
+        robot.drive()
+        robot.press()
+        assert robot.until(lambda: not robot.moves, 5.0)
+        robot.drive()
+        gate.send_signal(signal.SIGHUP)
+        assert robot.until(lambda: gate.poll() is not None, 10.0)
+        assert gate.returncode == 0
+        assert robot.until(lambda: not robot.moves, 5.0)
+    told = read_all(exit_)
+    os.close(exit_)
+    (log,) = (tmp_path / "log").iterdir()
+    assert log.name.startswith("command_gate_")
+    for text in (told, log.read_text()):
+        assert "[command_gate]: running" in text
+        assert "stopped by e_stop_pressed" in text

@@ -4,18 +4,19 @@ import math
 from types import SimpleNamespace
 
 import pytest
-
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from rclpy.parameter import Parameter
 
+from nics_drl_bridge.config import find_config, list_shipped, share_folder
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.nodes import parameters
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.nodes import parameters, runner
 from nics_drl_bridge.nodes.parameters import NODES, find_frame_fault, is_stamped_default
 from nics_drl_bridge.nodes.qos import get_given_values
 from nodes.in_process import node_class
+from nodes.test_command_gate import PLAIN, Robot
 
 pytestmark = pytest.mark.ros
+
 
 RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
 RCLPY_TOPICS = ("/rosout", "/parameter_events", "/transition_event")
@@ -151,3 +152,36 @@ def test_values_that_are_given_are_known_before_they_are_declared(make_node):
     assert not node.has_parameter("rate")
     assert node.declare_parameter("rate", 1).value == 2
     assert node.declare_parameter("plugins", ["a"]).value is None
+
+
+FILES = sorted((share_folder() / "config" / "nodes").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", NODES)
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
+def test_a_file_sets_what_a_node_has_and_does_not_derive_from_its_robot(
+    name, file, make_node
+):
+    node = make_node(words=("--params-file", str(file), "-r", f"__node:={name}"))
+    rows = {row.name: row for row in NODES[name]().parameters}
+    for given, parameter in node.given.items():
+        if given == runner.SHARED and given not in rows:
+            continue
+        assert not rows[given].shown, given
+        found = runner.declare_row(node, rows[given])
+        assert found == pytest.approx(parameter.value, nan_ok=True), given
+
+
+@pytest.mark.parametrize("robot", list_shipped("robots"))
+def test_a_shipped_robot_is_armed_with_the_shipped_parameters(
+    direct, clock, tmp_path, robot
+):
+    given = [f"model:={robot}", f"limits:={robot}", "e_stop_required:=false", *PLAIN]
+    file = find_config("bridge", "nodes")
+    words = ["--params-file", str(file), "-r", "__node:=command_gate"]
+    for each in (*given, f"black_box:={tmp_path}"):
+        words += ["-p", f"command_gate:{each}"]  # as specific as those of `launch`
+    standing = Robot(direct, clock, builtin_model(robot), words=words)
+    standing.run(2.0)
+    answer = standing.gate.call("~/arm")
+    assert answer.success, answer.message

@@ -6,9 +6,9 @@ import os
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip("torch", reason="needs the extra 'train'")
 
+import torch
 from extras.foreign_policies import nets
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from policy.policy_rig import export_remembering, network
@@ -22,10 +22,10 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.policy.train.export import export_policy
-from nodes.in_process import LINES
 from nodes.peer import PlayedRobot, odometry, stamp_ns
 
 pytestmark = pytest.mark.ros
+torch.set_num_threads(1)
 
 GOAL = [1.5, 0.5]
 START_NS = 10**9
@@ -142,18 +142,16 @@ def test_a_foreign_policy_commands_what_it_does_in_process(open_robot, model, tm
 
 
 def test_scans_that_can_not_fill_its_sectors_are_refused_in_one_sentence_once(
-    open_robot, file
+    open_robot, file, logged
 ):
     robot = open_robot(file, "deadline:=5.0")
     narrow = scan_of(np.linspace(-1.0, 1.0, 200))
-    known = len(LINES["MainThread"])
     for k in range(3):
         narrow.header.stamp = conversions.stamp_to_ros(START_NS + k)
         robot.give("scan", narrow)
     answer(robot, scan_of(around(720)), START_NS + PERIOD_NS)  # it goes on
-    refusals = [line for line in LINES["MainThread"][known:] if "not used" in line]
-    assert len(refusals) == 1
-    assert "looks from -57.3 to 57.3 deg" in refusals[0]
+    (refusal,) = (line for line in logged if "not used" in line)
+    assert "looks from -57.3 to 57.3 deg" in refusal
     assert len(robot.sent["cmd_vel_raw"]) == 1
 
 
@@ -189,7 +187,7 @@ def test_a_policy_that_fails_when_it_runs_is_one_sentence_and_leaves_a_zero(
 
 
 def test_a_policy_with_a_state_begins_anew_with_a_goal_an_activation_and_after_a_gap(
-    open_robot, model, tmp_path
+    open_robot, model, tmp_path, logged
 ):
     file = tmp_path / "car.onnx"
     export_remembering(file, model, scan="around")
@@ -221,9 +219,9 @@ def test_a_policy_with_a_state_begins_anew_with_a_goal_an_activation_and_after_a
     robot.node.trigger_deactivate()
     robot.node.trigger_activate()
     assert drive(18) == pytest.approx(wanted, abs=1e-4)
-    known = len(LINES["MainThread"])
+    logged.clear()
     assert drive(48) == pytest.approx(wanted, abs=1e-4)
-    (reset,) = (line for line in LINES["MainThread"][known:] if "was reset" in line)
+    (reset,) = (line for line in logged if "was reset" in line)
     assert "no observation for 2.5 s, longer than the 0.5 s" in reset
     stamps = [stamp_ns(raw) for raw in robot.sent["cmd_vel_raw"]]
     assert len(stamps) == 31  # one for each scan, and a zero

@@ -2,104 +2,58 @@ import math
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import Twist
 
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
-from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
-from nav_msgs.msg import Odometry
-from sensor_msgs.msg import LaserScan
-
+from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.policy_node import PolicyNode
-from nodes.peer import odometry, pose_of, stamp_ns
+from nodes.peer import odometry, scan, stamp_ns
 
 pytestmark = pytest.mark.ros
-
-RATE = 4.0
-
-
-@pytest.fixture(scope="module")
-def driving(launch, meet, module_domain_id):
-    """A policy whose commands move a simulator without a gate, and what is published."""
-    peer = meet(module_domain_id)
-    said = {
-        "scan": peer.listen(LaserScan, "scan"),
-        "ground_truth": peer.listen(Odometry, "ground_truth"),
-        "cmd_vel_raw": peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND),
-    }
-    commands = peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
-    peer.node.create_subscription(
-        TwistStamped,
-        "cmd_vel_raw",
-        lambda raw: commands.publish(raw.twist),
-        qos.COMMAND,
-    )
-    start = {"episode_start": [-2.0, 0.0, 0.0]}
-    simulator = launch(
-        "simulator_node", module_domain_id, world="empty", rate=RATE, **start
-    )
-    policy = launch("policy_node", module_domain_id, base_frame="car", rate=0.0)
-    goals = peer.speak(PoseStamped, "goal_pose")
-    peer.until(lambda: all(said.values()), "all topics")
-    yield peer, said, goals, policy
-    simulator.check()
-
-
-def speed(said):
-    return said["cmd_vel_raw"][-1].twist.linear.x
-
-
-def test_each_command_is_stamped_with_the_scan_it_was_computed_from(driving):
-    peer, said, _, _ = driving
-    known = len(said["cmd_vel_raw"])
-    peer.until(lambda: len(said["cmd_vel_raw"]) >= known + 10, "10 commands")
-    commands = [stamp_ns(raw) for raw in said["cmd_vel_raw"]]
-    scans = {stamp_ns(scan) for scan in said["scan"]}
-    answers = {
-        stamp for stamp in commands if stamp >= min(scans)
-    }  # this node may hear late
-    assert len(answers) >= 5
-    assert len(answers - scans) <= 1  # best effort
-    assert (np.diff(commands) > 0).all()  # one for each scan at most
-    assert all(raw.twist == Twist() for raw in said["cmd_vel_raw"])  # without a goal
-    assert said["cmd_vel_raw"][-1].header.frame_id == "car"
-
-
-def test_a_goal_by_topic_is_driven_to_and_stopped_at(driving):
-    peer, said, goals, _ = driving
-    goal = PoseStamped()
-    goal.pose.position.x, goal.pose.position.y = 0.0, 0.5
-    goals.publish(goal)
-    peer.until(lambda: speed(said) > 0.1, "driving")
-    peer.until(lambda: speed(said) == 0.0, "a stop")
-    truth = pose_of(said["ground_truth"][-1])
-    assert math.dist(truth[:2], (0.0, 0.5)) < 0.5
-    known = len(said["cmd_vel_raw"])
-    peer.until(lambda: len(said["cmd_vel_raw"]) >= known + 10, "10 more commands")
-    assert [raw.twist for raw in said["cmd_vel_raw"][known:]] == [Twist()] * 10
 
 
 @pytest.fixture
 def standing(direct):
-    """A policy node, and a function that publishes what a standing robot sees at a time."""
+    """Makes a policy node, and a function that shows it what a standing robot sees at a time."""
 
     def make(*given):
         robot = direct("rate:=0.0", "deadline:=5.0", *given, kind=PolicyNode)
         lidar = robot.node._model.lidar
-        ranges = np.full(lidar.beams, 3.0, np.float32)
 
-        def look(tenths, pose=(0.0, 0.0, 0.0)):
+        def look(tenths, pose=(0.0, 0.0, 0.0), twist=(0.0, 0.0, 0.0)):
             """Return the command after a scan at a time [0.1 s]."""
             stamp = tenths * NS_PER_S // 10
-            robot.give("odom", odometry(stamp, pose))
-            robot.give("scan", conversions.scan_to_ros(lidar, ranges, stamp, "laser"))
+            robot.give("odom", odometry(stamp, pose, twist))
+            robot.give("scan", scan(lidar, stamp, 3.0))
             return robot.sent["cmd_vel_raw"][-1]
 
         return robot, look
 
     return make
+
+
+def test_a_goal_by_topic_is_driven_to_and_stopped_at_with_an_answer_to_each_scan(
+    standing,
+):
+    robot, look = standing("base_frame:=car")
+    assert look(10).twist == Twist()  # without a goal
+    robot.give("goal_pose", conversions.pose_to_ros([2.0, 0.5, 0.0], 0, "map"))
+    pose = np.zeros(3)
+    twist = np.zeros(3)
+    speeds = []
+    for tenths in range(11, 90):
+        command = look(tenths, pose, twist)
+        assert stamp_ns(command) == tenths * NS_PER_S // 10
+        twist = conversions.twist_from_ros(command.twist)
+        pose = geometry.compose(pose, geometry.exp(0.1 * twist))
+        speeds.append(twist[0])
+    assert max(speeds) > 0.3
+    assert speeds[-10:] == [0.0] * 10
+    assert math.dist(pose[:2], (2.0, 0.5)) < 0.5
+    assert command.header.frame_id == "car"
+    assert len(robot.sent["cmd_vel_raw"]) == 80
 
 
 def test_a_goal_in_the_robots_frame_lies_ahead_of_it_and_one_in_no_known_frame_is_refused(

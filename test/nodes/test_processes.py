@@ -1,4 +1,3 @@
-import os
 import re
 import signal
 import subprocess
@@ -7,20 +6,27 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import node_process
+from nics_drl_bridge.nodes.listener import holds
+from nics_drl_bridge.nodes.node_process import ChildProcess
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 pytestmark = [pytest.mark.ros, pytest.mark.process]
 
-PARENT = """
-import sys, time
-from pathlib import Path
-from nics_drl_bridge.nodes.processes import NodeProcess
-with NodeProcess("command_gate", Path(sys.argv[1]), {}, int(sys.argv[2])) as node:
-    print(node.pid, flush=True)
+DEADLINE_S = 90.0
+
+HANG = """
+import signal, time
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+print("hangs", flush=True)
+time.sleep(600)
+"""
+PARENT = f"""
+import sys
+from nics_drl_bridge.nodes.node_process import ChildProcess
+with ChildProcess("child", [sys.executable, "-c", {HANG!r}]) as child:
+    print(child.pid, flush=True)
     sys.stdin.read()
 """
 
@@ -34,9 +40,13 @@ def alive(pid):
     return stat.rpartition(")")[2].split()[0] != "Z"
 
 
-def test_a_node_dies_with_its_parent_however_that_dies(tmp_path, domain_id, meet):
+def wait_for(condition, what):
+    assert holds(condition, DEADLINE_S, 0.01), what
+
+
+def test_a_node_dies_with_its_parent_however_that_dies():
     parent = subprocess.Popen(
-        [sys.executable, "-c", PARENT, str(tmp_path), str(domain_id)],
+        [sys.executable, "-c", PARENT],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -46,27 +56,24 @@ def test_a_node_dies_with_its_parent_however_that_dies(tmp_path, domain_id, meet
         assert alive(child)
         parent.kill()
         parent.wait()
-        meet(domain_id).until(lambda: not alive(child), "the end of the child")
+        wait_for(lambda: not alive(child), "the end of the child")
     finally:
         parent.kill()
         parent.communicate()
 
 
-def test_leaving_the_block_ends_a_node_that_hangs(
-    tmp_path, domain_id, meet, monkeypatch
-):
-    peer = meet(domain_id)
+def test_leaving_the_block_ends_a_node_that_hangs(tmp_path, monkeypatch):
     monkeypatch.setattr(node_process, "PATIENCE_S", 0.5)
-    with NodeProcess("command_gate", tmp_path / "hangs", {}, domain_id) as node:
-        # One that still starts has no handler yet: the first signal ends it, though held.
-        peer.until(lambda: "running" in node.log.read_text("utf-8"), "the gate")
-        os.kill(node.pid, signal.SIGSTOP)
-    assert not alive(node.pid)
-    assert node.close() == -signal.SIGKILL
+    log = tmp_path / "log"
+    command = [sys.executable, "-c", HANG]
+    with ChildProcess("child", command, log=log) as child:
+        wait_for(lambda: "hangs" in log.read_text(), "its start")
+    assert not alive(child.pid)
+    assert child.close() == -signal.SIGKILL
 
 
 def test_a_node_that_ended_by_itself_is_named_with_its_code_and_log(
-    tmp_path, domain_id, meet, monkeypatch
+    tmp_path, domain_id, monkeypatch
 ):
     """In a folder with modules of its own, as that of a model may have, which are not loaded."""
     canary = tmp_path / "canary"
@@ -75,7 +82,7 @@ def test_a_node_that_ended_by_itself_is_named_with_its_code_and_log(
     monkeypatch.chdir(tmp_path)
     wrong = {"policy": "dynamic_widow"}
     with NodeProcess("policy_node", tmp_path / "log", wrong, domain_id) as node:
-        meet(domain_id).until(lambda: node._process.poll() is not None, "its end")
+        wait_for(lambda: node.poll() is not None, "its end")
         expected = (
             "policy_node ended with code 2: unknown policy 'dynamic_widow'; did you mean "
             f"'dynamic_window'? (its log is {node.log})."

@@ -7,17 +7,14 @@ import time
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from robots import open_field
 
-from nics_drl_bridge.generator import builtin_model, save_model
 from nics_drl_bridge.identify.fit import measure_coverage
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.nodes import conversions, qos, record_node
+from nics_drl_bridge.nodes.simulator_node import SimulatorNode
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.robot.spec import load_robot
@@ -26,8 +23,6 @@ from nodes.peer import DEADLINE_S, odometry, pose_of
 pytestmark = pytest.mark.ros
 
 CAR = load_robot("ackermann")
-LONG_S = 180.0
-FAST = ("--duration", 40, "--use-sim-time", "--namespace", "bot")
 SHARE_OF_PATH = 0.1
 
 
@@ -80,7 +75,7 @@ def test_ctrl_c_leaves_a_zero_command_and_a_whole_recording(
 ):
     robot = FakeRobot(meet(domain_id))
     out = tmp_path / "drive.npz"
-    node = launch_process("record_node", domain_id, out=str(out))
+    node = launch_process("record_node", domain_id, out=str(out), duration=20.0)
     robot.until(lambda: robot.driven, "it drives")
     node._process.send_signal(signal.SIGINT)
     robot.until(lambda: code_of(node) is not None, "it ends")
@@ -98,7 +93,7 @@ class Drive:
 
     def __init__(self, direct, clock, *given, words=()):
         self._clock = clock
-        given = ("robot:=ackermann", *given)
+        given = ("robot:=ackermann", "duration:=20.0", *given)
         self.robot = direct(*given, kind=record_node.RecordNode, words=words)
         self.node = self.robot.node
         self.sent = self.robot.sent["cmd_vel"]
@@ -216,101 +211,69 @@ def test_a_robot_that_can_not_be_driven_is_not_moved(
     assert os.listdir() == []
 
 
-class Nics:
-    """`nics record` in a process of its own, in a folder."""
-
-    def __init__(self, folder, domain_id, *options, errors=subprocess.STDOUT):
-        self._said = folder / "said"
-        environment = {
-            "ROS_DOMAIN_ID": str(domain_id),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        }
-        cli = [sys.executable, "-m", "nics_drl_bridge.commands.cli"]
-        with self._said.open("wb") as log:
-            self.process = subprocess.Popen(
-                [*cli, "record", "--yes", *map(str, options)],
-                cwd=folder,
-                env=os.environ | environment,
-                stdout=log,
-                stderr=errors,
-            )
-
-    @property
-    def ended(self):
-        return self.process.poll() is not None
-
-    @property
-    def said(self):
-        return self._said.read_text(encoding="utf-8")
-
-
-@pytest.fixture
-def nics(tmp_path, domain_id):
-    """Start `nics record`; it ends with the test."""
-    started = []
-
-    def start(*options, **errors):
-        started.append(Nics(tmp_path, domain_id, *options, **errors))
-        return started[-1]
-
-    yield start
-    for each in started:
-        each.process.kill()
-        each.process.wait()
-
-
 @pytest.mark.process
 def test_ctrl_c_on_the_command_line_saves_a_bag_and_tells_what_it_holds(
-    nics, meet, domain_id, tmp_path
+    meet, domain_id, tmp_path
 ):
     pytest.importorskip("rosbags")
     robot = FakeRobot(meet(domain_id))
-    command = nics("--robot", "ackermann", "--out", "drive")
-    robot.until(lambda: robot.driven, "it drives")
-    command.process.send_signal(signal.SIGINT)
-    robot.until(lambda: command.ended, "it ends")
-    assert command.process.returncode == 130, command.said
+    cli = [sys.executable, "-m", "nics_drl_bridge.commands.cli", "record", "--yes"]
+    words = ["--robot", "ackermann", "--out", "drive", "--duration", "20"]
+    with (tmp_path / "said").open("w+", encoding="utf-8") as log:
+        command = subprocess.Popen(
+            [*cli, *words],
+            cwd=tmp_path,
+            env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
+            stdout=log,
+            stderr=log,
+        )
+        try:
+            robot.until(lambda: robot.driven, "it drives")
+            command.send_signal(signal.SIGINT)
+            robot.until(lambda: command.poll() is not None, "it ends")
+        finally:
+            command.kill()
+            command.wait()
+        log.seek(0)
+        told = log.read()
+    assert command.returncode == 130, told
     robot.peer.until(lambda: robot.heard[-1] == Twist(), "zero")
-    assert "interrupted: the robot was told to stop; " in command.said
-    assert "s are recorded in drive\n" in command.said
-    assert "steering_command: " in command.said
+    assert "interrupted: the robot was told to stop; " in told
+    assert "s are recorded in drive\n" in told
+    assert "steering_command: " in told
     assert set(os.listdir(tmp_path)) == {"said", "drive", "drive_preview.png"}
     assert seconds(tmp_path / "drive") > 0.5
 
 
-@pytest.mark.process
-@pytest.mark.timeout(480)
-@pytest.mark.parametrize("rate", [3.0, pytest.param(1.0, marks=pytest.mark.campaign)])
 def test_a_recorded_drive_of_a_simulator_generates_it_again(
-    nics, launch, meet, domain_id, tmp_path, rate
+    direct, clock, tmp_path, monkeypatch
 ):
-    save_model(builtin_model("differential"), tmp_path / "model")
-    parameters = {"model": str(tmp_path / "model"), "world": open_field(tmp_path)}
-    launch("simulator_node", domain_id, "bot", rate=rate, **parameters)
-    peer = meet(domain_id, "bot")
-    odom = peer.listen(Odometry, "odom")
-    heard = peer.listen(Twist, "cmd_vel", qos.COMMAND)
-    peer.until(lambda: odom, "the simulator runs")
+    monkeypatch.chdir(tmp_path)
     spec = load_robot("differential")
-    for out in ("drive", "again", "third"):  # a busy machine may hold up odometry
-        odom.clear()
-        command = nics("--robot", spec.name, "--out", f"{out}.npz", *FAST)
-        peer.until(lambda: command.ended, "the drive ends", LONG_S)  # noqa: B023
-        if "find out why odometry stopped" in command.said:
-            continue
-        assert command.process.returncode == 0, command.said
-        drive = recorded(tmp_path / f"{out}.npz", spec)
-        held_out = identify(drive, spec).held_out
-        if held_out.mean_position_error_m < SHARE_OF_PATH * held_out.mean_path_m:
-            break
-    else:
-        pytest.fail(f"no drive generates the robot again: {command.said}")
-    after = f"next: nics generate {out}.npz --robot {spec.name} --out {out}_model\n"
-    assert command.said.endswith(after)
-    assert heard[-1] == Twist()
-    poses = np.array([pose_of(message) for message in odom])
-    away = np.hypot(*(poses - poses[0])[:, :2].T) + spec.footprint_radius
+    given = (PLAIN, "model:=differential", f"world:={open_field(tmp_path)}")
+    simulated = direct(*given, kind=SimulatorNode)
+    drive = Drive(direct, clock, PLAIN, "robot:=differential")
+    poses = []
+    relayed = 0
+    while drive.node.outcome is None:
+        clock.now_s += 0.005
+        simulated.node._on_time()
+        poses += map(pose_of, simulated.sent["odom"])
+        for topic in ("joint_states", "odom"):
+            for message in simulated.sent[topic]:
+                drive.robot.give(topic, message)
+            simulated.sent[topic].clear()
+        drive.node._on_time()
+        for command in drive.sent[relayed:]:
+            simulated.give("cmd_vel", command)
+        relayed = len(drive.sent)
+    assert drive.node.outcome.complete, drive.node.outcome.line
+    assert drive.sent[-1] == Twist()
+    recording = recorded("drive.npz", spec)
+    held_out = identify(recording, spec).held_out
+    assert held_out.mean_position_error_m < SHARE_OF_PATH * held_out.mean_path_m
+    away = np.hypot(*(np.array(poses) - poses[0])[:, :2].T) + spec.footprint_radius
     assert 0.5 < away.max() < 2.0
-    assert all(
-        each.share > 0.6 and not each.fault for each in measure_coverage(drive, spec)
-    )
+    for each in measure_coverage(recording, spec):
+        assert each.share > 0.6
+        assert not each.fault

@@ -1,8 +1,10 @@
+import itertools
+import threading
+
 import pytest
-
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_msgs.msg import Bool
 
 from nics_drl_bridge.errors import BackendError, ConfigError
@@ -10,15 +12,20 @@ from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes import runner
 from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.nodes.listener import open_context
+from nics_drl_bridge.nodes.middleware_node import MiddlewareNode
 from nics_drl_bridge.nodes.parameters import Row
+from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.record_node import declare_drive
 from nics_drl_bridge.nodes.runner import (
+    FAILURE,
+    SUCCESS,
     declare_model,
     declare_row,
     explain_ignored_values,
 )
 from nics_drl_bridge.sim.world import load_world
+from nodes.peer import odometry, scan, stamp_ns
 
 pytestmark = pytest.mark.ros
 
@@ -94,3 +101,138 @@ def test_a_value_that_nothing_reads_is_named_with_the_nearest_parameter(make_nod
     assert "'command_timout'" in misspelt
     assert "did you mean 'command_timeout'?" in misspelt
     assert "'qos_overrides./scam.publisher.depth' is ignored" in quality
+
+
+def test_a_node_whose_callback_raises_is_stopped_before_its_context_ends(domain_id):
+    stopped = []
+
+    class Failing(Node):
+        def __init__(self, **options):
+            super().__init__("failing", **options)
+            runner.call_periodically(self, 0.01, self.fail)
+
+        def fail(self):
+            raise BackendError("of the policy")
+
+        def stop(self):
+            stopped.append(self.context.ok())
+
+    context = open_context([], domain_id)
+    with pytest.raises(BackendError, match="of the policy"):
+        runner.run_until_end(Failing, context, threading.Event())
+    assert stopped == [True]
+    assert not context.ok()
+
+
+def test_a_node_is_the_only_one_of_its_name_in_its_namespace_until_it_ends(domain_id):
+    def open_in(space):
+        words = ["node", "--ros-args", "-r", f"__ns:=/{space}"]
+        return open_context(words, domain_id)
+
+    told = f"a node '/one/gate' already runs in ROS domain {domain_id}; end it"
+    with runner.claim_name(open_in("one"), "gate"):
+        with pytest.raises(BackendError, match=told):
+            runner.run_until_end(None, open_in("one"), threading.Event(), "gate")
+        with runner.claim_name(open_in("two"), "gate"):
+            pass
+    with runner.claim_name(open_in("one"), "gate"):
+        pass
+
+
+def test_a_policy_is_silent_unless_active_and_leaves_a_zero_when_it_ceases(direct):
+    robot = direct(
+        "autostart:=false",
+        "goal:=[2.0, 0.0]",
+        "rate:=0.0",
+        "deadline:=5.0",
+        kind=PolicyNode,
+    )
+    node = robot.node
+    sent = robot.sent["cmd_vel_raw"]
+    tenths = itertools.count(10)
+
+    def look():
+        """Show a scan; return the speeds that were commanded so far."""
+        stamp = next(tenths) * 10**8
+        robot.give("odom", odometry(stamp))
+        robot.give("scan", scan(node._model.lidar, stamp, 3.0))
+        return [command.twist.linear.x for command in sent]
+
+    assert node.state == "unconfigured"
+    assert node.trigger_configure() == SUCCESS
+    assert look() == []
+    assert node.trigger_activate() == SUCCESS
+    speeds = look()
+    assert min(speeds) > 0.0
+    assert node.trigger_deactivate() == SUCCESS
+    assert look() == [*speeds, 0.0]
+    assert node.trigger_activate() == SUCCESS
+    speeds = look()
+    assert speeds[-1] > 0.0
+    assert node.trigger_shutdown() == SUCCESS
+    assert [command.twist.linear.x for command in sent] == [*speeds, 0.0]
+
+
+def test_what_a_node_reads_when_it_is_configured_can_be_changed_before_only(make_node):
+    node = make_node("autostart:=false", kind=PolicyNode)
+
+    def set_to(name, value):
+        return node.set_parameters([Parameter(name, value=value)])[0]
+
+    assert node.trigger_configure() == SUCCESS
+    late = set_to("goal", [0.0, 0.0])
+    assert not late.successful
+    assert "'goal'" in late.reason
+    assert "cleanup" in late.reason
+    assert node.trigger_cleanup() == SUCCESS
+    assert set_to("policy", "dynamic_windowl").successful
+    assert node.trigger_configure() == FAILURE
+    assert node.state == "unconfigured"
+    assert set_to("policy", "dynamic_window").successful
+    assert node.trigger_configure() == SUCCESS
+
+
+def test_a_middleware_publishes_its_estimate_only_while_active_and_its_state_always(
+    direct,
+):
+    robot = direct("autostart:=false", kind=MiddlewareNode)
+    node = robot.node
+    estimates = robot.sent["odometry/filtered"]
+    stamps = iter(range(10**9, 10**10, 10**8))
+
+    def hear():
+        robot.give("odom", odometry(next(stamps)))
+        return robot.diagnose().message, len(estimates)
+
+    assert robot.diagnose().message == "unconfigured"
+    assert not robot.call("~/reset").success
+    assert node.trigger_configure() == SUCCESS
+    assert robot.diagnose().message == "nothing on scan, odom yet"
+    hear()
+    assert estimates == []
+    assert node.trigger_activate() == SUCCESS
+    hear()
+    assert [stamp_ns(estimate) for estimate in estimates] == [11 * 10**8]
+    assert node.trigger_deactivate() == SUCCESS
+    assert hear()[1] == 1
+    assert node.trigger_cleanup() == SUCCESS
+    assert robot.diagnose().message == "unconfigured"
+
+
+@pytest.mark.parametrize("autostart", [True, False])
+def test_a_mistake_in_configure_ends_a_node_that_leads_itself_and_no_other(
+    make_node, monkeypatch, logged, autostart
+):
+    def fail(_):
+        raise TypeError("a mistake of ours")
+
+    monkeypatch.setattr(PolicyNode, "configure", fail)
+    node = make_node(f"autostart:={autostart}", kind=PolicyNode)
+    if autostart:
+        with pytest.raises(TypeError, match="a mistake of ours"):
+            node.start()
+        return
+    node.start()
+    node.trigger_configure()
+    assert node.state == "unconfigured"
+    assert "TypeError: a mistake of ours" in logged

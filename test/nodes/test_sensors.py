@@ -5,9 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import LaserScan
 
@@ -17,6 +14,7 @@ from nics_drl_bridge.generator import save_model
 from nics_drl_bridge.lidar.further_lidar import FurtherLidar
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes import conversions, gate_inputs, qos
+from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.sim.world import load_world
 from nodes.peer import drive_alike
 
@@ -40,49 +38,30 @@ def two_lidars(model, tmp_path_factory):
     return made, str(folder)
 
 
-@pytest.fixture(scope="module")
-def simulator(launch, module_domain_id, two_lidars):
-    process = launch(
-        "simulator_node", module_domain_id, model=two_lidars[1], mode="lockstep"
-    )
-    yield module_domain_id
-    process.check()
-
-
-def test_an_env_over_dds_sees_both_lidars_as_the_one_in_process(simulator, two_lidars):
+def test_an_env_over_dds_sees_both_lidars_as_the_one_in_process(
+    launch, meet, domain_id, two_lidars
+):
+    launch("simulator_node", domain_id, model=two_lidars[1], mode="lockstep")
+    peer = meet(domain_id)
+    scans = peer.listen(LaserScan, "rear_scan", qos.SENSOR)
     arguments = {"model": two_lidars[0], "world": "arena", "task_options": TASK}
-    options = {"domain_id": simulator}
+    options = {"domain_id": domain_id}
     here = BridgeEnv(estimator=True, **arguments)
     with closing(BridgeEnv("dds", backend_options=options, **arguments)) as there:
-        drive_alike(here, there)
+        drive_alike(here, there, seeds=(3,))
         _, *_, info = there.step(there.action_space.sample())
         assert info["rear_scan_stamp_ns"] == info["scan_stamp_ns"]
-
-
-def test_its_scan_and_its_place_are_published(simulator, meet, two_lidars):
-    peer = meet(simulator)
-    scans = peer.listen(LaserScan, "rear_scan", qos.SENSOR)
-    arguments = {"model": two_lidars[0], "world": "arena"}
-    options = {"domain_id": simulator}
-    with closing(BridgeEnv("dds", backend_options=options, **arguments)) as env:
         # Again, as the first may be published before the peer's subscription is known.
-        peer.until(lambda: env.reset(seed=0) and scans, "a scan from the back")
+        peer.until(lambda: there.reset(seed=0) and scans, "a scan from the back")
     assert scans[-1].header.frame_id == "rear_laser"
     sensor = two_lidars[0].sensors[0]
     assert sensor.read(scans[-1]).shape == (91,)
 
 
-def test_a_simulator_without_the_sensor_is_of_another_model(
-    launch, domain_id, model, two_lidars
-):
-    launch("simulator_node", domain_id, mode="lockstep")
-    with pytest.raises(BackendError, match="rear_scan"):
-        BridgeEnv(
-            model=two_lidars[0],
-            world=load_world("arena"),
-            backend="dds",
-            backend_options={"domain_id": domain_id, "timeout_s": 5.0},
-        )
+def test_a_sensor_that_nobody_publishes_is_missing(domain_id, two_lidars):
+    options = {"domain_id": domain_id, "timeout_s": 0.3}
+    with pytest.raises(BackendError, match="no publisher of /rear_scan"):
+        DdsBackend(two_lidars[0], load_world("arena"), **options)
 
 
 def test_the_gate_reads_where_a_sensor_shows_something(two_lidars):

@@ -4,13 +4,11 @@ import json
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import NodeNameNonExistentError
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.nodes import middleware_node, policy_node
 from nics_drl_bridge.nodes.conversions import find_message_type
 from nics_drl_bridge.nodes.runner import ERROR, OK, STALE, WARN
 from nodes.test_security import NODES, read_rights
@@ -127,7 +125,8 @@ def test_a_recording_drive_may_do_what_it_does_and_nothing_else(
     stack, launch, module_domain_id, tmp_path
 ):
     node = "record_node"
-    launch(node, module_domain_id, "recording", out=str(tmp_path / "drive.npz"))
+    given = {"out": str(tmp_path / "drive.npz"), "duration": 20.0}
+    launch(node, module_domain_id, "recording", **given)
     optional = {("subscribe", "/clock"), ("request", f"/{node}/get_parameters")}
     rights = read_rights("recording.xml")[node]
     stack.may_do_what_it_does(node, rights, optional, "/recording")
@@ -182,7 +181,11 @@ def test_every_panel_is_in_the_layout():
     assert sorted(list_panels(LAYOUT["layout"])) == sorted(PANELS)
 
 
-def test_a_held_robot_is_an_error_a_stopped_source_is_stale_and_all_end_in_order(stack):
+def test_a_held_robot_is_an_error_a_stopped_source_is_stale_and_all_end_in_order(
+    stack, monkeypatch
+):
+    for module in (middleware_node, policy_node):
+        monkeypatch.setattr(module, "SILENCE_S", 1.0)
     newest = {}
 
     def note(message):

@@ -4,9 +4,6 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 
@@ -20,7 +17,6 @@ from nics_drl_bridge.nodes.middleware_node import MiddlewareNode
 from nics_drl_bridge.nodes.parameters import is_stamped_default
 from nics_drl_bridge.nodes.simulator_node import SimulatorNode
 from nics_drl_bridge.sim.world import load_world
-from nodes.in_process import LINES
 from nodes.peer import stamp_ns
 
 pytestmark = pytest.mark.ros
@@ -51,18 +47,15 @@ def test_the_gate_sends_stamped_commands_in_the_frame_of_odometry_or_of_its_para
     ],
 )
 def test_who_publishes_commands_of_the_other_type_is_named(
-    direct, meet, domain_id, kind, topic, fix
+    direct, meet, domain_id, logged, kind, topic, fix
 ):
     node = direct("enable_stamped_cmd_vel:=true", kind=kind)
     stranger = meet(domain_id)
     stranger.node.create_publisher(Twist, topic, 1)
-    known = len(LINES["MainThread"])
 
     def list_warnings():
         node.fire_timers()
-        return [
-            each for each in LINES["MainThread"][known:] if "publishes geom" in each
-        ]
+        return [each for each in logged if "publishes geom" in each]
 
     stranger.until(list_warnings, "a warning")
     (line,) = list_warnings()

@@ -2,9 +2,6 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 

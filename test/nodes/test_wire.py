@@ -4,14 +4,14 @@ import struct
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy")
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.nodes import conversions, wire
+
+pytestmark = pytest.mark.ros
 
 STAMP_NS = 1_763_000_000_123_456_789
 POSE = np.array([1.25, -3.5, 2.0])

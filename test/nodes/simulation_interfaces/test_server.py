@@ -2,7 +2,6 @@ import math
 
 import pytest
 
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip(
     "simulation_interfaces", reason="needs what `nox -s messages` builds"
 )

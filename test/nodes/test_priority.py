@@ -4,11 +4,11 @@ import sys
 
 import pytest
 
-from nics_drl_bridge.nodes.command_gate import take_priority
+from nics_drl_bridge.nodes.own_process import take_priority
 
 CODE = """
 import os, threading
-from nics_drl_bridge.nodes.command_gate import take_priority
+from nics_drl_bridge.nodes.own_process import take_priority
 
 stop = threading.Event()
 other = threading.Thread(target=stop.wait)
