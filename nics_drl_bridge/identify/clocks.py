@@ -291,23 +291,24 @@ def _find_drift(
     command: Stream, spec: RobotSpec, target: Target, delay: DelayEstimate
 ) -> float:
     """Returns the rate [s/s] at which a delay grows over a drive; 0 unless it grows steadily."""
-    start, end, signal = target
     middles = []
     delays = []
-    for part in np.array_split(np.arange(len(start)), DRIFT_PARTS):
+    for part in np.array_split(np.arange(len(target[0])), DRIFT_PARTS):
         if len(part) < FEW_ROWS // 10:
             return 0.0
-        rows = start[part], end[part], signal[part]
-        found = _find_delay_near(make_response_residual(command, spec, rows), delay)
+        start, end, signal = (values[part] for values in target)
+        left_over = make_response_residual(command, spec, (start, end, signal))
+        found = _find_delay_near(left_over, delay)
         if found is None:
             return 0.0
-        middles.append(float(start[part].mean()))
+        middles.append(float(start.mean()))
         delays.append(found)
     rate, begin = np.polyfit(middles, delays, 1)
     off = np.abs(np.array(delays) - rate * np.array(middles) - begin).max()
     grown = abs(delays[-1] - delays[0])
-    steady = grown > LEAST_DRIFT_S and off < DRIFT_OFF * grown
-    return float(rate) if steady else 0.0
+    if grown > LEAST_DRIFT_S and off < DRIFT_OFF * grown:
+        return float(rate)
+    return 0.0
 
 
 def _find_delay_near(left_over: Left, delay: DelayEstimate) -> float | None:

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import compress
 from typing import Literal
 
 import numpy as np
@@ -89,7 +90,7 @@ def list_unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]
         else:
             followed = [c.name for c in spec.command]
         still[i] |= noise_only[i] and all(named[name] for name in followed)
-    return tuple(n for n, s in zip(spec.variable_names, still, strict=True) if s)
+    return tuple(compress(spec.variable_names, still))
 
 
 def list_commands_together(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:

@@ -21,8 +21,9 @@ from nics_drl_bridge.robot.kernels import (
 )
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-# most windows that are predicted at a time, for vector instructions
+# most windows that are predicted at a time, and how many vector instructions take at once
 LANES = 64
+VECTOR = 16
 # below this turn of a step the series of its sine and cosine are exact to the last digits [rad]
 SMALL_TURN = 0.1
 
@@ -122,7 +123,7 @@ def allocate_tangent(shot: Shot, terms: Terms, free: int) -> Tangent:
     """Allocates scratch memory for `shoot`."""
     windows, states = shot.state.shape
     blocks = max(1, -(-windows // LANES))
-    lanes = max(1, -(-windows // blocks))
+    lanes = VECTOR * max(1, -(-windows // (VECTOR * blocks)))
     depends = np.zeros((3 + states, states), dtype=np.bool_)
     for factors in terms.factors.T:
         by_state = factors < states
@@ -511,6 +512,50 @@ def _twist(state: Array, bicycle: BicycleGeometry) -> tuple[float, float, float]
 
 
 @kernel
+def _keep_lags(share: float, dt: float, lag: Array) -> tuple[float, float, float]:
+    """Returns the shares of their distances from the targets that actuators keep in a step."""
+    span = share * dt
+    return (
+        1.0 / (1.0 + span / lag[0]),
+        1.0 / (1.0 + span / lag[1]),
+        1.0 / (1.0 + span / lag[2]),
+    )
+
+
+@kernel
+def _advance_actuator(
+    state: Array,
+    target: Array,
+    place: float,
+    kept: tuple[float, float, float],
+    lag: Array,
+    limit: Array,
+) -> None:
+    """Moves an actuator (3,) towards its target (G, 3) at a place between rows."""
+    held = min(max(place, 0.0), len(target) - 2.0)
+    k = int(held)
+    for i in range(3):
+        aim = target[k, i] + (held - k) * (target[k + 1, i] - target[k, i])
+        if i == 0:
+            aim = _limited(state[0], aim, lag[0], limit)
+        state[i] = aim + (state[i] - aim) * kept[i]
+
+
+@kernel
+def _rotate_half(half: float) -> tuple[float, float]:
+    """Returns cosine and sine of half the turn of a step."""
+    if abs(half) > SMALL_TURN:
+        return math.cos(half), math.sin(half)
+    square = half * half
+    cosine = 1.0 - square / 30.0 * (1.0 - square / 56.0)
+    sine = 1.0 - square / 42.0 * (1.0 - square / 72.0)
+    return (
+        1.0 - square / 2.0 * (1.0 - square / 12.0 * cosine),
+        half * (1.0 - square / 6.0 * (1.0 - square / 20.0 * sine)),
+    )
+
+
+@kernel
 def roll_windows(
     ends: Array,
     actuator: Array,
@@ -528,30 +573,28 @@ def roll_windows(
     angle of a steered robot; `target` (G, 3) their targets on a grid, `begin` (W,) indices in it;
     `lag` (3,) [s]; `limit` (2,) of the speed's acceleration and deceleration [m/s^2].
     """
+    kept_by_step = _keep_lags(1.0, dt, lag)
     for w in range(len(begin)):
         x = 0.0
         y = 0.0
         heading = 0.0
+        c = 1.0
+        s = 0.0
         done = 0.0
-        state = actuator[w]
         for h in range(stops.shape[1]):
             while done < stops[w, h] - 1e-9:
                 share = min(1.0, stops[w, h] - done)
-                place = min(max(begin[w] + done, 0.0), len(target) - 2.0)
-                k = int(place)
-                for i in range(3):
-                    aim = target[k, i] + (place - k) * (target[k + 1, i] - target[k, i])
-                    if i == 0:
-                        aim = _limited(state[0], aim, lag[0], limit)
-                    state[i] = aim + (state[i] - aim) / (1.0 + share * dt / lag[i])
-                vx, vy, turn = _twist(state, bicycle)
+                kept = kept_by_step if share == 1.0 else _keep_lags(share, dt, lag)
+                place = begin[w] + done
+                _advance_actuator(actuator[w], target, place, kept, lag, limit)
+                vx, vy, turn_rate = _twist(actuator[w], bicycle)
                 span = share * dt
-                middle = heading + 0.5 * turn * span
-                c = math.cos(middle)
-                s = math.sin(middle)
+                cosine, sine = _rotate_half(0.5 * turn_rate * span)
+                c, s = c * cosine - s * sine, s * cosine + c * sine  # half-way
                 x += span * (c * vx - s * vy)
                 y += span * (s * vx + c * vy)
-                heading += turn * span
+                c, s = c * cosine - s * sine, s * cosine + c * sine
+                heading += turn_rate * span
                 done += share
             ends[w, h, 0] = x
             ends[w, h, 1] = y

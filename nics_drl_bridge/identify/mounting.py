@@ -329,7 +329,7 @@ def estimate_mounting_by_twists(
     if size[2] <= MIN_SECOND * size[0]:
         return None
     gain = np.linalg.lstsq(expected, motion.twist, rcond=None)[0]
-    sigma = _estimate_gain_errors(motion, expected, gain)
+    sigma = _estimate_gain_errors(motion, expected, motion.twist - expected @ gain)
     sine = gain[0, 1] - gain[1, 0]  # both times twice the factor
     cosine = gain[0, 0] + gain[1, 1]
     sine_sigma = np.hypot(sigma[0, 1], sigma[1, 0])
@@ -348,10 +348,12 @@ def estimate_mounting_by_twists(
 
 
 def _estimate_gain_errors(
-    motion: TwistIntervals, expected: Array, gain: Array
+    motion: TwistIntervals, expected: Array, rest: Array
 ) -> Array:
-    """Returns the standard errors (3, 3) of the gain of the expected twists (n, 3)."""
-    rest = motion.twist - expected @ gain
+    """Returns the standard errors (3, 3) of the gain of the expected twists (n, 3).
+
+    `rest` (n, 3) is what the gain leaves of the measured ones.
+    """
     edges = np.linspace(motion.start[0], motion.end[-1], BLOCKS + 1)
     block = np.searchsorted(edges[1:-1], motion.start, "right")
     errors = [estimate_clustered_errors(expected, column, block) for column in rest.T]

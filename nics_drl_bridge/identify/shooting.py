@@ -264,9 +264,8 @@ def predict_along_path(
     slopes = []
     for dof in range(3):
         slope = path.differentiate(chi[free[dof]], dof)
-        turned = slope[:, 2, first][
-            ..., None
-        ]  # before the window, which does not count
+        # How the heading changes before a window does not count in it.
+        turned = slope[:, 2, first][..., None]
         slope = slope[..., last] - slope[..., first][..., None]
         slope[:, 0] += turned * moved[1]
         slope[:, 1] -= turned * moved[0]

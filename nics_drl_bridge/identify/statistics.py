@@ -86,7 +86,6 @@ def minimise_robustly(
     ends there. The residual is computed at most `evaluations` times. Raises ValueError if the
     residual of the start is not finite.
     """
-    low, high = bounds
     here = _Point(start, residual(start), size)
     if not np.isfinite(here.loss):
         raise ValueError("the residual of the start is not finite.")
@@ -101,7 +100,7 @@ def minimise_robustly(
         improved = 0.0
         gain = 1.0
         while left > 0 and damping < most and not improved:
-            theta = np.clip(here.theta + step.find(damping), low, high)
+            theta = np.clip(here.theta + step.find(damping), *bounds)
             trial = _Point(theta, residual(theta), size)
             left -= 1
             if not trial.loss < here.loss:
