@@ -215,24 +215,28 @@ def _find_shared_stamps(
     step = find_dividing_step(period, usual)
     if abs(step - usual) > SAME_STEP * usual:
         return None
-    since = [s.t - pose.t[0] for s in (pose, state, command)]
-    tick = [np.round(t / step) for t in since]
-    off = max(
-        float(np.abs(t - n * step).max()) for t, n in zip(since, tick, strict=True)
-    )
-    if off > UNIFORM * max(1.0, float(pose.t[-1] - pose.t[0])):
+    times = [stream.t - pose.t[0] for stream in (pose, state, command)]
+    ticks = [np.round(t / step) for t in times]
+    off = [np.abs(t - n * step).max() for t, n in zip(times, ticks, strict=True)]
+    if max(off) > UNIFORM * max(1.0, float(pose.t[-1] - pose.t[0])):
         return None
-    ticks, at_pose, at_state = np.intersect1d(tick[0], tick[1], return_indices=True)
-    ticks, both, at_command = np.intersect1d(ticks, tick[2], return_indices=True)
-    if len(ticks) < SHARED * max(map(len, tick)):
+    by_pose, by_state, by_command = _find_shared_rows(ticks)
+    if len(by_pose) < SHARED * max(map(len, ticks)):
         return None
-    at = at_pose[both]
     return (
-        pose.t[at],
-        pose.values[at],
-        state.values[at_state[both]],
-        command.values[at_command],
+        pose.t[by_pose],
+        pose.values[by_pose],
+        state.values[by_state],
+        command.values[by_command],
     )
+
+
+def _find_shared_rows(ticks: list[Array]) -> tuple[NDArray[np.intp], ...]:
+    """Returns the rows of three streams whose ticks (T,) are in all of them."""
+    pose, state, command = ticks
+    shared, first, second = np.intersect1d(pose, state, return_indices=True)
+    _, both, third = np.intersect1d(shared, command, return_indices=True)
+    return first[both], second[both], third
 
 
 def _make_grid(

@@ -291,27 +291,35 @@ def _find_drift(
     command: Stream, spec: RobotSpec, target: Target, delay: DelayEstimate
 ) -> float:
     """Returns the rate [s/s] at which a delay grows over a drive; 0 unless it grows steadily."""
-    start, end, signal = target
-    trials = delay.value + np.arange(
-        -DRIFT_REACH_S, DRIFT_REACH_S + DRIFT_STEP_S, DRIFT_STEP_S
-    )
     middles = []
     delays = []
-    for part in np.array_split(np.arange(len(start)), DRIFT_PARTS):
+    for part in np.array_split(np.arange(len(target[0])), DRIFT_PARTS):
         if len(part) < FEW_ROWS // 10:
             return 0.0
-        rows = start[part], end[part], signal[part]
-        left_over = make_response_residual(command, spec, rows)
-        left = [float((left_over(delay.lags, trial) ** 2).mean()) for trial in trials]
-        if min(left) > MOST_UNEXPLAINED:
+        start, end, signal = (values[part] for values in target)
+        left_over = make_response_residual(command, spec, (start, end, signal))
+        found = _find_delay_near(left_over, delay)
+        if found is None:
             return 0.0
-        middles.append(float(start[part].mean()))
-        delays.append(float(trials[int(np.argmin(left))]))
+        middles.append(float(start.mean()))
+        delays.append(found)
     rate, begin = np.polyfit(middles, delays, 1)
     off = np.abs(np.array(delays) - rate * np.array(middles) - begin).max()
     grown = abs(delays[-1] - delays[0])
-    steady = grown > LEAST_DRIFT_S and off < DRIFT_OFF * grown
-    return float(rate) if steady else 0.0
+    if grown > LEAST_DRIFT_S and off < DRIFT_OFF * grown:
+        return float(rate)
+    return 0.0
+
+
+def _find_delay_near(left_over: Left, delay: DelayEstimate) -> float | None:
+    """Returns the delay [s] around that of a whole drive that leaves least; None if too much."""
+    trials = delay.value + np.arange(
+        -DRIFT_REACH_S, DRIFT_REACH_S + DRIFT_STEP_S, DRIFT_STEP_S
+    )
+    left = [float((left_over(delay.lags, trial) ** 2).mean()) for trial in trials]
+    if min(left) > MOST_UNEXPLAINED:
+        return None
+    return float(trials[int(np.argmin(left))])
 
 
 def make_nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
@@ -459,19 +467,21 @@ def add_wheel_scales(drive: Drive, calibration: Calibration) -> Calibration:
         agreement = float((difference * turn).mean()) / size
         swapped = agreement < 0.0 if abs(agreement) > 0.5 else None
         calibration = replace(calibration, wheels_swapped=swapped)
-    sigma = dict(calibration.uncertainty)
-    scales: dict[str, Any] = {}
-    for name, units, moved in (
-        ("wheel_scale", wheels.mean(axis=1), compute_forward_speed(drive, calibration)),
-        ("turn_scale", difference, turn),
-    ):
-        if not float(units @ units) > 0.0:
-            continue
-        scale = float(units @ moved / (units @ units))
-        error = float(
-            estimate_standard_errors(units[:, None], moved - scale * units)[0]
-        )
-        if abs(scale) > CERTAIN * error:
-            scales[name] = scale
-            sigma[name] = error
-    return replace(calibration, **scales, uncertainty=sigma)
+    speed = compute_forward_speed(drive, calibration)
+    calibration = _add_scale(calibration, "wheel_scale", wheels.mean(axis=1), speed)
+    return _add_scale(calibration, "turn_scale", difference, turn)
+
+
+def _add_scale(
+    calibration: Calibration, name: str, units: Array, moved: Array
+) -> Calibration:
+    """Adds the scale by which a motion (n,) follows units (n,) of the wheels, if it is certain."""
+    if not float(units @ units) > 0.0:
+        return calibration
+    scale = float(units @ moved / (units @ units))
+    error = float(estimate_standard_errors(units[:, None], moved - scale * units)[0])
+    if abs(scale) <= CERTAIN * error:
+        return calibration
+    named: dict[str, Any] = {name: scale}
+    uncertainty = calibration.uncertainty | {name: error}
+    return replace(calibration, **named, uncertainty=uncertainty)

@@ -13,7 +13,8 @@ sizes of terms can be compared.
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import compress
 from typing import Literal
 
 import numpy as np
@@ -89,7 +90,7 @@ def list_unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]
         else:
             followed = [c.name for c in spec.command]
         still[i] |= noise_only[i] and all(named[name] for name in followed)
-    return tuple(n for n, s in zip(spec.variable_names, still, strict=True) if s)
+    return tuple(compress(spec.variable_names, still))
 
 
 def list_commands_together(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
@@ -266,28 +267,27 @@ def measure_coverage(
 ) -> tuple[CommandCoverage, ...]:
     """Measures the coverage of each command of a recording, by the same rules as a fit."""
     t = recording.command.t
-    row = recording.command.values
     grid = np.arange(t[0], t[-1], GRID_S)
-    command = row[np.searchsorted(t, grid, side="right") - 1]
+    rows = np.searchsorted(t, grid, side="right") - 1
+    command = recording.command.values[rows]
     nothing = np.zeros((len(grid), 3))
     samples = samples_on_one_clock(grid, nothing, nothing[:, :0], command)
     excited = Excitation.of(samples, spec.model_copy(update={"state": ()}))
     faults = dict.fromkeys(excited.together, "moved only together with others")
     faults |= dict.fromkeys(excited.unmoved, "never moved")
-    lowest, highest = np.percentile(command, ENDS, axis=0)
-    share = (highest - lowest) / (spec.command_high - spec.command_low)
-    own_share = _measure_own_shares(samples.x)
+    ranges = np.percentile(command, ENDS, axis=0).T.tolist()
+    own_shares = _measure_own_shares(samples.x).tolist()
     return tuple(
         CommandCoverage(
             c.name,
             c.unit,
-            low=float(lowest[i]),
-            high=float(highest[i]),
-            share=float(share[i]),
-            own=float(own_share[i]),
+            low=low,
+            high=high,
+            share=(high - low) / (c.max - c.min),
+            own=own,
             fault=faults.get(c.name, ""),
         )
-        for i, c in enumerate(spec.command)
+        for c, (low, high), own in zip(spec.command, ranges, own_shares, strict=True)
     )
 
 
@@ -460,49 +460,68 @@ def regress(
     """
     plausible = select_plausible_rows(samples.x, spec)
     samples = samples.rows(plausible)
-    names = spec.variable_names
     excited = Excitation.of(samples, spec)
-    all_powers = taylor.list_exponents(len(names), order)
-    moved_powers = select_moved_terms(all_powers, names, excited.unmoved)
-    if term_filter is not None:
-        used = term_filter(moved_powers, spec).any(axis=0)
-        moved_powers = moved_powers[used]
+    if term_filter is None:
+        unmoved = excited.unmoved if noisy else None
+        term_filter = partial(_select_default_terms, unmoved_if_noisy=unmoved)
+    moved_powers = select_moved_terms(
+        taylor.list_exponents(len(spec.variable_names), order),
+        spec.variable_names,
+        excited.unmoved,
+    )
+    moved_powers = moved_powers[term_filter(moved_powers, spec).any(axis=0)]
     check_sample_count(samples, len(moved_powers))
     chi = taylor.evaluate(samples.x, moved_powers)
     independent, dependent = split_independent_columns(chi)
-    chi = chi[:, independent]
     powers = moved_powers[independent]
-
-    dofs = samples.dq.shape[1]
-    if term_filter is not None:
-        allowed = term_filter(powers, spec)
-    else:
-        allowed = np.ones((dofs, len(powers)), dtype=np.bool_)
-        if noisy:
-            allowed[TWIST_ROWS] = select_twist_terms(powers, spec, excited.unmoved)
-    beta = np.zeros((dofs, len(powers)))
-    inliers = np.ones((dofs, len(samples.dq)), dtype=np.bool_)
-    moving = list_moving_dofs(samples.dq)
-    usual_ranges = measure_usual_ranges(samples.dq)
-    for d in moving:
-        features = chi[:, allowed[d]]
-        beta[d, allowed[d]], inliers[d] = _fit_features(
-            features, samples.dq[:, d], float(usual_ranges[d]), noisy
-        )
+    chi = chi[:, independent]
+    beta, inliers = _fit_rates(samples.dq, chi, term_filter(powers, spec), noisy)
     return Regression(
         samples=samples,
         powers=powers,
         chi=chi,
         beta=beta,
         inliers=inliers,
-        moving=moving,
+        moving=list_moving_dofs(samples.dq),
         excitation=excited,
-        dependent=tuple(
-            taylor.format_term(row, names) for row in moved_powers[dependent]
-        ),
-        terms_total=dofs * len(all_powers),
+        dependent=_name_terms(moved_powers[dependent], spec.variable_names),
+        terms_total=_count_terms(spec, order),
         left_out=1.0 - float(plausible.mean()),
     )
+
+
+def _select_default_terms(
+    powers: NDArray[np.int64], spec: RobotSpec, unmoved_if_noisy: tuple[str, ...] | None
+) -> NDArray[np.bool_]:
+    """Selects the terms (D, K) of a recording: all, but not in the twist if it is noisy."""
+    allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
+    if unmoved_if_noisy is not None:
+        allowed[TWIST_ROWS] = select_twist_terms(powers, spec, unmoved_if_noisy)
+    return allowed
+
+
+def _name_terms(powers: NDArray[np.int64], names: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(taylor.format_term(row, names) for row in powers)
+
+
+def _count_terms(spec: RobotSpec, order: int) -> int:
+    """Returns the number of coefficients of a model before any selection."""
+    powers = taylor.list_exponents(len(spec.variable_names), order)
+    return len(spec.dof_names) * len(powers)
+
+
+def _fit_rates(
+    dq: Array, chi: Array, allowed: NDArray[np.bool_], noisy: bool
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Returns standardised coefficients (D, K), and the rows (D, T) of rates (T, D) that fit."""
+    beta = np.zeros(allowed.shape)
+    inliers = np.ones((len(allowed), len(dq)), dtype=np.bool_)
+    usual_ranges = measure_usual_ranges(dq).tolist()
+    for d in list_moving_dofs(dq):
+        beta[d, allowed[d]], inliers[d] = _fit_features(
+            chi[:, allowed[d]], dq[:, d], usual_ranges[d], noisy
+        )
+    return beta, inliers
 
 
 def _fit_features(
@@ -564,15 +583,39 @@ def prune_and_refit(regression: Regression, spec: RobotSpec, alpha: Alpha) -> Fi
     With `auto` in place of a threshold, terms are taken in the order of their size, the fewest
     whose cross-validated error is within one standard error of the minimum.
     """
-    samples = regression.samples
+    coefficients, errors = _refit_dofs(regression, spec, alpha)
+    conditions = np.ones(len(coefficients))
+    for d in regression.moving:
+        kept = coefficients[d] != 0.0
+        features, _ = regression.rows(d)
+        conditions[d] = statistics.compute_condition(features[:, kept])
+        if np.isnan(errors[d, kept]).any():
+            errors[d, kept] = _estimate_errors(regression, d, coefficients[d], kept)
+    model = _make_model(regression, spec, coefficients, errors)
+    rmse, r2 = _measure_fit(regression, model)
+    outliers = 1.0 - (1.0 - regression.left_out) * regression.inliers.mean(axis=1)
+    return Fit(model, regression, rmse, r2, alpha, outliers, conditions)
+
+
+def fit_kept_terms(
+    regression: Regression, spec: RobotSpec, alpha: Alpha
+) -> TaylorModel:
+    """Does the same as `prune_and_refit`, without errors, which take most of the time."""
+    coefficients, _ = _refit_dofs(regression, spec, alpha)
+    return _make_model(regression, spec, coefficients)
+
+
+def _refit_dofs(
+    regression: Regression, spec: RobotSpec, alpha: Alpha
+) -> tuple[Array, Array]:
+    """Returns coefficients (D, K) of the kept terms; errors of those by instruments, else NaN."""
     coefficients = np.zeros(regression.beta.shape)
-    errors = np.zeros(regression.beta.shape)
-    conditions = np.ones(len(regression.beta))
-    needs_instruments = states_are_noisy(samples, spec)
+    errors = np.full(regression.beta.shape, np.nan)
+    needs_instruments = states_are_noisy(regression.samples, spec)
     for d in regression.moving:
         kept = _select_terms(regression, d, spec, alpha)
         if kept.any():
-            coefficients[d, kept], errors[d, kept] = _refit_terms(regression, d, kept)
+            coefficients[d, kept] = _refit_terms(regression, d, kept)
         if needs_instruments and d >= TWIST_ROWS.stop:
             by_instruments = _fit_by_instruments(
                 regression, d, coefficients[d], len(spec.state)
@@ -580,9 +623,18 @@ def prune_and_refit(regression: Regression, spec: RobotSpec, alpha: Alpha) -> Fi
             if by_instruments is not None:
                 terms = np.flatnonzero(coefficients[d])
                 coefficients[d, terms], errors[d, terms] = by_instruments
-        features, _ = regression.rows(d)
-        conditions[d] = statistics.compute_condition(features[:, kept])
-    used = np.abs(coefficients).sum(axis=0) > 0.0
+    return coefficients, errors
+
+
+def _make_model(
+    regression: Regression,
+    spec: RobotSpec,
+    coefficients: Array,
+    errors: Array | None = None,
+) -> TaylorModel:
+    """Returns the model of the terms that have coefficients (D, K), maybe with errors (D, K)."""
+    samples = regression.samples
+    used = coefficients.any(axis=0)
     model = TaylorModel(
         spec.variable_names,
         spec.dof_names,
@@ -592,32 +644,43 @@ def prune_and_refit(regression: Regression, spec: RobotSpec, alpha: Alpha) -> Fi
         samples.dt,
         samples.x.min(axis=0),
         samples.x.max(axis=0),
-        std_errors=errors[:, used],
     )
+    if errors is None:
+        return model
+    known = np.where(model.coefficients != 0.0, errors[:, used], 0.0)
+    return replace(model, std_errors=known)
+
+
+def _measure_fit(regression: Regression, model: TaylorModel) -> tuple[Array, Array]:
+    """Returns RMSE (D,) and R2 (D,) of a model's rates, each without its outliers."""
+    samples = regression.samples
     rmse, r2 = statistics.measure_rate_errors(model, samples)
     for d in regression.moving:
         inside = regression.inliers[d]
         if not inside.all():
-            rmse_inside, r2_inside = statistics.measure_rate_errors(
-                model, samples.rows(inside)
-            )
-            rmse[d] = rmse_inside[d]
-            r2[d] = r2_inside[d]
-    outliers = 1.0 - (1.0 - regression.left_out) * regression.inliers.mean(axis=1)
-    return Fit(model, regression, rmse, r2, alpha, outliers, conditions)
+            errors, shares = statistics.measure_rate_errors(model, samples.rows(inside))
+            rmse[d] = errors[d]
+            r2[d] = shares[d]
+    return rmse, r2
 
 
-def _refit_terms(
-    regression: Regression, d: int, kept: NDArray[np.bool_]
-) -> tuple[Array, Array]:
-    """Returns the coefficients, and their errors, of the terms (K,) that are kept (Eq. 1)."""
+def _refit_terms(regression: Regression, d: int, kept: NDArray[np.bool_]) -> Array:
+    """Returns the coefficients of the terms (K,) that are kept (Eq. 1)."""
     features, target = regression.rows(d)
     spreads = _spreads(features[:, kept])
+    beta = np.linalg.lstsq(features[:, kept] / spreads, target, rcond=None)[0]
+    return np.asarray(beta / spreads)
+
+
+def _estimate_errors(
+    regression: Regression, d: int, coefficients: Array, kept: NDArray[np.bool_]
+) -> Array:
+    """Returns the standard errors of the coefficients (K,) that are kept."""
+    features, target = regression.rows(d)
+    residual = target - features @ coefficients
+    spreads = _spreads(features[:, kept])
     standardised = features[:, kept] / spreads
-    beta = np.linalg.lstsq(standardised, target, rcond=None)[0]
-    residual = target - standardised @ beta
-    errors = statistics.estimate_standard_errors(standardised, residual)
-    return beta / spreads, errors / spreads
+    return statistics.estimate_standard_errors(standardised, residual) / spreads
 
 
 def _select_terms(

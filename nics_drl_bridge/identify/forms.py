@@ -9,6 +9,7 @@ from functools import lru_cache
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
@@ -114,31 +115,16 @@ def find_input_curve(
 def _fit_curve(
     samples: Samples, spec: RobotSpec, place: int, dof: int
 ) -> FoundCurve | None:
-    command = samples.x[:, len(spec.state) :]
-    twist = {v.twist: samples.x[:, i] for i, v in enumerate(spec.state) if v.twist}
-    speed = twist.get("vx", np.zeros(len(samples.t)))
-    stride = max(1, round(STRIDE_S / samples.dt))
-    target = twist[POSE_RATES[dof]][::stride]
-    reach = np.array([command[:, place].min(), command[:, place].max()])
+    """Returns the curve of a command that best explains a component of the twist, if one does."""
+    sent = samples.x[:, len(spec.state) + place]
+    reach = np.array([sent.min(), sent.max()])
 
     def measure_rest(dead: float, full: float) -> float:
-        """Returns the sum of squares that a curve leaves unexplained, at the best lag."""
-        effect = command.copy()
-        effect[:, place] = _make_curve("", reach, dead, full).of(command[:, place])
-        least = np.inf
-        for lag in LAGS_S:
-            columns = [np.ones(len(speed))]
-            kept = float(np.exp(-samples.dt / lag))
-            for u in effect.T:
-                low = lag_behind(np.append(u, 0.0), 0.0, kept)[1:]
-                columns += [low] if dof == 0 else [low, low * speed]
-            chi = np.stack(columns, axis=1)[::stride]
-            rest = target - chi @ np.linalg.lstsq(chi, target, rcond=None)[0]
-            least = min(least, float(rest @ rest))
-        return least
+        curve = _make_curve("", reach, dead, full)
+        return _measure_rest(samples, spec, place, dof, curve)
 
     straight = measure_rest(0.0, 1.0)
-    if straight < NOTHING**2 * len(speed):
+    if straight < NOTHING**2 * len(sent):
         return None
     trials = [(measure_rest(0.0, full), 0.0, full) for full in FULL]
     full = min(trials)[2]
@@ -149,6 +135,41 @@ def _fit_curve(
         return None
     curve = _make_curve(spec.command[place].name, reach, dead, full)
     return FoundCurve(curve, gain, dof == 0)
+
+
+def _measure_rest(
+    samples: Samples, spec: RobotSpec, place: int, dof: int, curve: InputCurve
+) -> float:
+    """Returns the sum of squares that a curve of a command leaves unexplained, at the best lag."""
+    effect = samples.x[:, len(spec.state) :].copy()
+    effect[:, place] = curve.of(effect[:, place])
+    stride = max(1, round(STRIDE_S / samples.dt))
+    twist = _get_twist(samples, spec)
+    speed = twist[:, 0]
+    target = twist[::stride, dof]
+    least = np.inf
+    for lag in LAGS_S:
+        lagged = [_lag_command(u, float(np.exp(-samples.dt / lag))) for u in effect.T]
+        if dof:
+            lagged += [low * speed for low in lagged]
+        chi = np.stack([np.ones(len(speed)), *lagged], axis=1)[::stride]
+        rest = target - chi @ np.linalg.lstsq(chi, target, rcond=None)[0]
+        least = min(least, float(rest @ rest))
+    return least
+
+
+def _get_twist(samples: Samples, spec: RobotSpec) -> Array:
+    """Returns the components (T, 3) of the twist that are states, and zeros for others."""
+    twist = np.zeros((len(samples.t), 3))
+    for i, variable in enumerate(spec.state):
+        if variable.twist:
+            twist[:, POSE_RATES.index(variable.twist)] = samples.x[:, i]
+    return twist
+
+
+def _lag_command(command: Array, kept: float) -> Array:
+    """Returns a command (T,) behind a first-order lag."""
+    return lag_behind(np.append(command, 0.0), 0.0, kept)[1:]
 
 
 def _make_curve(name: str, reach: Array, dead: float, full: float) -> InputCurve:
@@ -298,27 +319,31 @@ def choose_start(
     problem: shooting.Shooting, model: TaylorModel, known: tuple[str, ...]
 ) -> shooting.Shooting:
     """Starts limits of states that are not `known` where predictions are best, with the lags."""
-    names = list(problem.parameters.names)
-    times = [k for k, name in enumerate(names) if name.endswith((".lag", ".delay"))]
-    times.append(names.index("latency"))
+    names = problem.parameters.names
     for name in names:
         state = name.removesuffix(".rise")
         if state == name or name in known or f"{state}.lag" not in names:
             continue
-        places = [names.index(f"{state}.{word}") for word in ("rise", "fall")]
         coarse = replace(problem, spacing_s=START_SPACING_S)
-        trials = []
-        for rate, share in product(RATES, SHARES):
-            start = problem.parameters.start.copy()
-            start[places] *= rate
-            start[times] *= share
-            start = np.clip(start, problem.parameters.low, problem.parameters.high)
-            trials.append((coarse.measure_mean_error(model, start), start))
-        best = min(trials, key=lambda trial: trial[0])
-        problem = replace(
-            problem, parameters=replace(problem.parameters, start=best[1])
-        )
+        starts = _list_starts(problem.parameters, state)
+        errors = [coarse.measure_mean_error(model, start) for start in starts]
+        best = starts[int(np.argmin(errors))]
+        problem = replace(problem, parameters=replace(problem.parameters, start=best))
     return problem
+
+
+def _list_starts(parameters: shooting.Parameters, state: str) -> list[Array]:
+    """Returns starts (I,) of the limits of a state, with delays and lags that fit to these."""
+    names = parameters.names
+    limits = np.isin(names, [f"{state}.rise", f"{state}.fall"])
+    times = [n == "latency" or n.endswith((".lag", ".delay")) for n in names]
+    starts = []
+    for rate, share in product(RATES, SHARES):
+        start = parameters.start.copy()
+        start[limits] *= rate
+        start[times] *= share
+        starts.append(np.clip(start, parameters.low, parameters.high))
+    return starts
 
 
 def set_lag(
@@ -335,51 +360,87 @@ def set_lag(
     return replace(model, coefficients=coefficients)
 
 
+class _InEffect:
+    """Commands in effect at the rows of a drive, and states that follow these."""
+
+    def __init__(self, evidence: Evidence, form: Form) -> None:
+        self.drive = evidence.drive
+        self.form = form
+        self.dt = evidence.samples.dt
+        self.t = evidence.samples.t
+        self.rows: slice | NDArray[np.intp] = slice(None)
+        if form.followed:
+            self._begin_at_first_command()
+        self.commands = {c.name for c in self.drive.spec.command}
+        self.follower = _make_follower(self.drive.spec, self.dt)
+        # Most parameters affect neither commands nor states.
+        self._average = lru_cache(maxsize=8)(self._average_commands)
+        self._roll = lru_cache(maxsize=8)(self._roll_states)
+
+    def _begin_at_first_command(self) -> None:
+        """Extends the times back to the first command, from which on states follow."""
+        first = self.t[0]
+        sent = self.drive.recording.command.t[0]
+        lead = int(np.ceil(max(0.0, first - sent) / self.dt)) + 1
+        rows = np.round((self.t - first) / self.dt).astype(np.intp) + lead
+        steps = np.arange(-lead, rows[-1] - lead + 1) + MIDDLE_OF_STEP
+        self.t = first + self.dt * steps
+        self.rows = rows
+
+    def find_commands(self, at: shooting.Values) -> Array:
+        """Returns the commands (T, C) in effect for values of the parameters."""
+        return np.asarray(self._find_all_commands(at)[self.rows])
+
+    def find_states(self, at: shooting.Values) -> Array:
+        """Returns the states (T, S) that follow them."""
+        # A mounting, whose names have no dot, does not affect a state.
+        return self._roll(
+            tuple(item for item in at.items() if "." in item[0] or item[0] == "latency")
+        )
+
+    def _find_all_commands(self, at: shooting.Values) -> Array:
+        names = {"latency"} | self.commands
+        return self._average(
+            tuple(item for item in at.items() if item[0].partition(".")[0] in names)
+        )
+
+    def _average_commands(self, items: tuple[tuple[str, float], ...]) -> Array:
+        at = dict(items)
+        begin = self.t - self.form.find_latency(at)
+        command = self.drive.recording.command
+        curves = self.form.make_curves(at)
+        return average_effect(command, self.drive.spec, curves, begin, begin + self.dt)
+
+    def _roll_states(self, items: tuple[tuple[str, float], ...]) -> Array:
+        at = dict(items)
+        sent = self._find_all_commands(at)
+        spec = self.drive.spec
+        gains = [at.get(f"{v.name}.gain", 1.0) for v in spec.state]
+        begin = np.array(gains) * sent[0, list_followed_commands(spec)]
+        model = self.form.actuate(self.follower, at)
+        _, states = roll(model, begin[None], sent[None])
+        return np.asarray(states[0][self.rows])
+
+
 def make_prediction_problem(
     evidence: Evidence, form: Form, parameters: shooting.Parameters
 ) -> shooting.Shooting:
     """Returns the prediction problem of a drive, to find the parameters of a form."""
     drive = evidence.drive
-    samples = evidence.samples
-    command = drive.recording.command
-    spec = drive.spec
-    dt = samples.dt
-    t = samples.t
-    rows = np.arange(len(t))
-    if form.followed:  # states that follow the commands do so from the first one on
-        lead = int(np.ceil(max(0.0, t[0] - command.t[0]) / dt)) + 1
-        rows = np.round((t - t[0]) / dt).astype(np.intp) + lead
-        t = t[0] + dt * (np.arange(-lead, rows[-1] - lead + 1) + MIDDLE_OF_STEP)
-
-    @lru_cache(maxsize=8)  # most parameters do not affect the commands
-    def average_commands(latency: float, curves: tuple[InputCurve, ...]) -> Array:
-        return average_effect(command, spec, curves, t - latency, t - latency + dt)
-
-    def compute_all_commands(at: shooting.Values) -> Array:
-        return average_commands(form.find_latency(at), form.make_curves(at))
-
-    @lru_cache(maxsize=8)  # nor do the coefficients affect such a state
-    def follow(items: tuple[tuple[str, float], ...]) -> Array:
-        at = dict(items)
-        sent = compute_all_commands(at)
-        gains = [at.get(f"{v.name}.gain", 1.0) for v in spec.state]
-        begin = np.array(gains) * sent[0, list_followed_commands(spec)]
-        model = form.actuate(_make_follower(spec, dt), at)
-        _, states = roll(model, begin[None], sent[None])
-        return np.asarray(states[0][rows])
+    in_effect = _InEffect(evidence, form)
+    noise, _ = drive.pose_noise or (0.0, 0.0)
 
     def trust(start: Array, end: Array) -> Array:
         offset = evidence.calibration.clock_offset_s
         return drive.trust(start - offset, end - offset)
 
-    noise, _ = drive.pose_noise or (0.0, 0.0)
     return shooting.Shooting(
-        samples,
+        evidence.samples,
         parameters,
-        commands=lambda at: compute_all_commands(at)[rows],
+        commands=in_effect.find_commands,
         shape=form.actuate,
         trust=trust,
-        inferred=(lambda at: follow(tuple(at.items()))) if form.followed else None,
+        inferred=in_effect.find_states if form.followed else None,
         noise_m=noise,
     )
 
@@ -401,32 +462,51 @@ def _make_follower(spec: RobotSpec, dt: float) -> TaylorModel:
 
 def list_parameters(evidence: Evidence, form: Form) -> shooting.Parameters:
     """Returns the parameters of a form besides coefficients: start, scale and bounds by name."""
-    spec = evidence.drive.spec
-    samples = evidence.samples
     rows = _list_command_values(evidence, form)
     rows |= _list_follower_values(evidence, form)
+    rows |= _list_motor_values(evidence, form)
+    if form.mounted:
+        rows |= _list_mounting_values(evidence.drive.spec, form)
+    return shooting.Parameters(tuple(rows), *np.array(list(rows.values())).T)
+
+
+def _list_motor_values(evidence: Evidence, form: Form) -> dict[str, Row]:
+    """Returns the rows of friction, drag and limits of states."""
+    spec = evidence.drive.spec
+    samples = evidence.samples
     rates = {v.name: samples.dq[:, 3 + i] for i, v in enumerate(spec.state)}
     variables = dict(zip(spec.variable_names, samples.x.T, strict=True))
-    gains = {r.state: abs(r.gain) for r in evidence.calibration.responses}
-    for state, command in form.followed:
-        size = gains[state] * float(np.ptp(variables[command]))
-        rates[state] = np.array([-size, size])
+    for response in evidence.calibration.responses:
+        if (response.state, response.command) in form.followed:
+            size = abs(response.gain) * float(np.ptp(variables[response.command]))
+            rates[response.state] = np.array([-size, size])
+    rows = {}
     for name in form.friction:
         rows[f"{name}.friction"] = _start_small(_find_strong(np.abs(rates[name])))
     for name in form.drag:
         rows |= _list_drag_values(name, rates[name], variables, spec)
     for name in form.limits:
-        for word, rate in (("fall", -rates[name]), ("rise", rates[name])):
-            size = max(_find_strong(rate), 1e-3)
-            rows[f"{name}.{word}"] = (size, 0.3 * size, 0.05 * size, 20.0 * size)
-    if form.mounted:  # the remaining error of the mounting
-        reach = 2.0 * spec.footprint_radius
-        mounting = {"x": (LEVER_SCALE_M, reach), "y": (LEVER_SCALE_M, reach)}
-        mounting["heading"] = (TURN_SCALE, np.pi)
-        for name, (scale, most) in mounting.items():
-            most = most if name in form.mounted else 0.0
-            rows[name] = (0.0, scale, -most, most)
-    return shooting.Parameters(tuple(rows), *np.array(list(rows.values())).T)
+        rows[f"{name}.fall"] = _start_at_strong(-rates[name])
+        rows[f"{name}.rise"] = _start_at_strong(rates[name])
+    return rows
+
+
+def _list_mounting_values(spec: RobotSpec, form: Form) -> dict[str, Row]:
+    """Returns the rows of what remains of the error of the mounting."""
+    reach = 2.0 * spec.footprint_radius
+    mounting = {"x": (LEVER_SCALE_M, reach), "y": (LEVER_SCALE_M, reach)}
+    mounting["heading"] = (TURN_SCALE, np.pi)
+    rows = {}
+    for name, (scale, most) in mounting.items():
+        most = most if name in form.mounted else 0.0
+        rows[name] = (0.0, scale, -most, most)
+    return rows
+
+
+def _start_at_strong(rates: Array) -> Row:
+    """Returns start, scale and bounds of a limit, near the strong rates of a drive (T,)."""
+    size = max(_find_strong(rates), 1e-3)
+    return size, 0.3 * size, 0.05 * size, 20.0 * size
 
 
 def _find_strong(rates: Array) -> float:
@@ -457,20 +537,20 @@ def _list_follower_values(evidence: Evidence, form: Form) -> dict[str, Row]:
     """Returns the rows of lags [s] and gains of states that follow commands."""
     spec = evidence.drive.spec
     rows = {}
-    scaled = find_speed_index(spec)
-    names = [v.name for v in spec.state]
+    speed = find_speed_index(spec)
+    scaled = None if speed is None else spec.state[speed].name
+    is_known = are_lags_measured(evidence.calibration) and not form.limits
     for response in evidence.calibration.responses:
         state = response.state
         if (state, response.command) not in form.followed:
             continue
         lag = float(np.clip(response.lag_s, *LAG_RANGE_S))
-        is_known = are_lags_measured(evidence.calibration) and not form.limits
         bounds = (lag, lag) if is_known else LAG_RANGE_S
         rows[f"{state}.lag"] = (lag, LAG_SCALE_S, *bounds)
-        if scaled is not None and names[scaled] == state:
-            size = abs(response.gain)
-            low, high = sorted((0.2 * response.gain, 5.0 * response.gain))
-            rows[f"{state}.gain"] = (response.gain, 0.1 * size, low, high)
+        if state == scaled:
+            gain = response.gain
+            low, high = sorted((0.2 * gain, 5.0 * gain))
+            rows[f"{state}.gain"] = (gain, 0.1 * abs(gain), low, high)
     return rows
 
 
@@ -488,19 +568,27 @@ def _list_command_values(evidence: Evidence, form: Form) -> dict[str, Row]:
     rows = {"latency": (latency, DELAY_SCALE_S, *shared)}
     rows |= {f"{name}.delay": (at, DELAY_SCALE_S, *bounds) for name, at in form.delays}
     for curve in form.curves:
-        name = curve.command
-        size = max(abs(curve.least), abs(curve.most))
-        if np.isfinite(size):
-            step = CURVE_SCALE * size
-            widest = 0.5 * size if curve.dead else 0.0
-            least = curve.least
-            most = curve.most
-            rows[f"{name}.dead"] = (curve.dead, step, 0.0, widest)
-            rows[f"{name}.least"] = (least, step, 1.5 * least, 0.5 * least)
-            rows[f"{name}.most"] = (most, step, 0.5 * most, 1.5 * most)
-        if name in form.back:
-            rows[f"{name}.back"] = (curve.back, BACK_SCALE, *BACK_RANGE)
+        rows |= _list_curve_values(curve)
+        if curve.command in form.back:
+            rows[f"{curve.command}.back"] = (curve.back, BACK_SCALE, *BACK_RANGE)
     return rows
+
+
+def _list_curve_values(curve: InputCurve) -> dict[str, Row]:
+    """Returns the rows of a curve's dead zone and ends; none for a curve without ends."""
+    size = max(abs(curve.least), abs(curve.most))
+    if not np.isfinite(size):
+        return {}
+    name = curve.command
+    step = CURVE_SCALE * size
+    widest = 0.5 * size if curve.dead else 0.0
+    least = curve.least
+    most = curve.most
+    return {
+        f"{name}.dead": (curve.dead, step, 0.0, widest),
+        f"{name}.least": (least, step, 1.5 * least, 0.5 * least),
+        f"{name}.most": (most, step, 0.5 * most, 1.5 * most),
+    }
 
 
 def find_two_way_curves(evidence: Evidence) -> tuple[InputCurve, ...]:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import product
 from typing import Any
 
@@ -62,6 +62,15 @@ class Trial:
     error: float  # mean error after `HORIZON_S`, as a fraction of the path
     # (W,) distances at the ends of predictions, by horizon [m]
     errors: dict[float, Array]
+
+    @classmethod
+    def of(cls, order: int, pull: float, far: Array, paths: Array) -> "Trial":
+        """Returns a trial whose predictions end `far` (W, H) off, after paths (W, H) [m]."""
+        length = float(np.nansum(paths[:, -1]))
+        share = float(np.nansum(far[:, -1])) / length if length else np.nan
+        columns = zip(BANDS_S, far.T, strict=True)
+        errors = {horizon: column[~np.isnan(column)] for horizon, column in columns}
+        return cls(order, pull, share, errors)
 
     @property
     def level(self) -> float:
@@ -181,20 +190,11 @@ class Draft:
         self, found: shooting.Predictive, linear: TaylorModel
     ) -> TaylorModel:
         """Returns a found model with standard errors; those of other terms are a linear fit's."""
-        model = found.model
         errors = found.coefficient_errors.copy()
-        at = found.named
-        sigma = found.errors
         for state, command in self.form.followed:
-            row = terms.FIRST_STATE + model.variables.index(state)
-            own = terms.find_linear_term(model, state)
-            driven = terms.find_linear_term(model, command)
-            rate, gained = np.abs(model.coefficients[row, [own, driven]])
-            relative = sigma[f"{state}.lag"] / at[f"{state}.lag"]
-            by_gain = rate * sigma.get(f"{state}.gain", 0.0)
-            errors[row, own] = rate * relative
-            errors[row, driven] = np.hypot(gained * relative, by_gain)
+            _add_lag_errors(errors, found, state, command)
         named = {dof: dict(by_term) for dof, by_term in linear.named_errors.items()}
+        model = found.model
         for dof, by_term in replace(model, std_errors=errors).named_errors.items():
             named.setdefault(dof, {}).update(by_term)
         return model.add_errors(named)
@@ -223,24 +223,29 @@ class Draft:
         A weaker pull is not tried for an order whose error grew by a factor of `HOPELESS` already
         from the pull before.
         """
-        parameters = self.problem.parameters.freeze()
-        problem = replace(self.problem, spacing_s=SPACING_S, parameters=parameters)
-        draft = replace(self, problem=problem)
-        folds = list(draft.list_folds({order for order, pull in asked if pull}))
+        folds = list(self.list_folds({order for order, pull in asked if pull}))
         trials: list[Trial] = []
         hopeless = set()
         for order, pull in asked:
             if order in hopeless:
                 continue
-            trial = draft.try_hypothesis(order, pull, folds)
+            trial = self._coarse.try_hypothesis(order, pull, folds)
             before = [other for other in trials if other.order == order]
             if before and trial.error > HOPELESS * before[-1].error:
                 hopeless.add(order)
             trials.append(trial)
         return tuple(trials)
 
-    def list_folds(self, orders: Collection[int]) -> Iterator["Fold"]:
-        """Yields the parts of a drive to leave out.
+    @cached_property
+    def _coarse(self) -> "Draft":
+        """The same draft with fewer windows, and with known parameters, for trials."""
+        parameters = self.problem.parameters.freeze()
+        problem = replace(self.problem, spacing_s=SPACING_S, parameters=parameters)
+        return replace(self, problem=problem)
+
+    @cached_property
+    def _folds(self) -> tuple["Fold", ...]:
+        """The parts of a drive to leave out, with the base fitted to the rest.
 
         A part is not left out if a variable would not have moved without it, or if the rest is too
         short to fit a model.
@@ -249,15 +254,23 @@ class Draft:
         spec = self.library.spec
         everything = np.arange(len(samples.t))
         unmoved = list_unmoved_variables(samples, spec)
+        folds = []
         for block in np.array_split(everything, FOLDS):
             unseen = np.isin(everything, block)
             if list_unmoved_variables(samples.rows(~unseen), spec) != unmoved:
                 continue
             with suppress(FitError):
-                base = self.fit_base(~unseen).model
-                inside = self.select(~unseen)
-                starts = {k: self.library.fit(inside, k).model for k in orders}
-                yield Fold(unseen, base, starts)
+                base = self._coarse.fit_base(~unseen).model
+                folds.append(Fold(unseen, base, {}))
+        return tuple(folds)
+
+    def list_folds(self, orders: Collection[int]) -> Iterator["Fold"]:
+        """Yields the folds whose rest is long enough for fits of all orders, with these fits."""
+        for fold in self._folds:
+            with suppress(FitError):
+                inside = self._coarse.select(~fold.unseen)
+                starts = {k: self.library.fit_model(inside, k) for k in orders}
+                yield replace(fold, starts=starts)
 
     def try_hypothesis(self, order: int, pull: float, folds: list["Fold"]) -> Trial:
         """Predicts the parts that were left out of the fits of a hypothesis."""
@@ -273,12 +286,23 @@ class Draft:
             error, path = judge.errors(model, judge.parameters.start, fold.unseen)
             distances.append(np.hypot(error[..., 0], error[..., 1]))
             paths.append(path)
-        far = np.concatenate(distances)
-        length = float(np.nansum(np.concatenate(paths)[:, -1]))
-        share = float(np.nansum(far[:, -1])) / length if length else np.nan
-        columns = zip(BANDS_S, far.T, strict=True)
-        errors = {horizon: column[~np.isnan(column)] for horizon, column in columns}
-        return Trial(order, pull, share, errors)
+        return Trial.of(order, pull, np.concatenate(distances), np.concatenate(paths))
+
+
+def _add_lag_errors(
+    errors: Array, found: shooting.Predictive, state: str, command: str
+) -> None:
+    """Writes the errors (D, K) of the terms by which a state follows a command."""
+    model = found.model
+    row = terms.FIRST_STATE + model.variables.index(state)
+    own = terms.find_linear_term(model, state)
+    driven = terms.find_linear_term(model, command)
+    rate, gained = np.abs(model.coefficients[row, [own, driven]])
+    sigma = found.errors
+    relative = sigma[f"{state}.lag"] / found.named[f"{state}.lag"]
+    by_gain = rate * sigma.get(f"{state}.gain", 0.0)
+    errors[row, own] = rate * relative
+    errors[row, driven] = np.hypot(gained * relative, by_gain)
 
 
 @dataclass(frozen=True)
@@ -308,30 +332,19 @@ class Base:
     found: shooting.Predictive
     candidates: tuple[Candidate, ...] = ()  # forms that were tried, in this order
 
+    @cached_property
+    def trial(self) -> Trial:
+        """The cross-validation of the textbook with this form."""
+        return self.draft.cross_validate((TEXTBOOK,))[0]
+
 
 def fit_base(evidence: forms.Evidence, clear: tuple[InputCurve, ...]) -> Base:
     """Fits the textbook with and without each part of a form; keeps what improves predictions.
 
     `clear` curves are always kept.
     """
-    plain_form = forms.make_form(evidence)
-    inputs = evidence.calibration.inputs
-    best = fit_form(evidence, replace(plain_form, curves=inputs))
-    trial = cross_validate_base(best)
-    start = "textbook with input curves" if inputs else "textbook"
-    candidates = [Candidate(start, trial.error, kept=True)]
-    if len(inputs) > len(clear):
-        plain = fit_form(evidence, replace(plain_form, curves=clear))
-        plain_trial = cross_validate_base(plain)
-        # an infinite level: too short to judge
-        is_better = plain_trial.level < trial.level or np.isinf(plain_trial.level)
-        candidates = [
-            Candidate("textbook", plain_trial.error, kept=True),
-            Candidate("input curves", trial.error, kept=not is_better),
-        ]
-        if is_better:
-            best = plain
-            trial = plain_trial
+    best = _choose_curves(evidence, clear)
+    candidates = list(best.candidates)
     # Each change builds on those that were kept before it, so their order matters.
     tried = [best.draft.form]  # since the last that was kept
     for name, change, worth in list_changes(evidence):
@@ -340,15 +353,33 @@ def fit_base(evidence: forms.Evidence, clear: tuple[InputCurve, ...]) -> Base:
             continue
         tried.append(form)
         changed = fit_form(evidence, form, best)
-        changed_trial = cross_validate_base(changed)
-        is_better = changed_trial.level < worth * trial.level
-        is_better &= _is_certain(changed.found, best.found)
-        candidates.append(Candidate(name, changed_trial.error, kept=is_better))
+        is_better = changed.trial.level < worth * best.trial.level
+        is_better = is_better and _is_certain(changed.found, best.found)
+        candidates.append(Candidate(name, changed.trial.error, kept=is_better))
         if is_better:
             best = changed
-            trial = changed_trial
             tried = [form]
     return replace(best, candidates=tuple(candidates))
+
+
+def _choose_curves(evidence: forms.Evidence, clear: tuple[InputCurve, ...]) -> Base:
+    """Fits the plainest form with all input curves found, or with the `clear` ones if better."""
+    plain_form = forms.make_form(evidence)
+    inputs = evidence.calibration.inputs
+    curved = fit_form(evidence, replace(plain_form, curves=inputs))
+    if len(inputs) <= len(clear):
+        start = "textbook with input curves" if inputs else "textbook"
+        return replace(
+            curved, candidates=(Candidate(start, curved.trial.error, kept=True),)
+        )
+    plain = fit_form(evidence, replace(plain_form, curves=clear))
+    # an infinite level: too short to judge
+    is_better = plain.trial.level < curved.trial.level or np.isinf(plain.trial.level)
+    candidates = (
+        Candidate("textbook", plain.trial.error, kept=True),
+        Candidate("input curves", curved.trial.error, kept=not is_better),
+    )
+    return replace(plain if is_better else curved, candidates=candidates)
 
 
 def refit_base(evidence: forms.Evidence, former: Base) -> Base:
@@ -377,11 +408,6 @@ def fit_form(
     parameters = replace(problem.parameters, start=found.values)
     problem = replace(problem, parameters=parameters)
     return Base(Draft(evidence.library, form, problem), found)
-
-
-def cross_validate_base(base: Base) -> Trial:
-    """Cross-validates the textbook with the form of a base."""
-    return base.draft.cross_validate((TEXTBOOK,))[0]
 
 
 def list_changes(evidence: forms.Evidence) -> Iterator[Change]:

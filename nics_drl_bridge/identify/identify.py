@@ -532,14 +532,18 @@ def prefer_textbook(drive: Drive, findings: Findings) -> Findings:
     The held-out part chooses between them, so the errors there are slightly optimistic if a
     textbook is chosen: they are the lowest of three. The report says so.
     """
-    if findings.yardstick is None:
+    fitted = findings.yardstick
+    if fitted is None or not judging.is_beaten_by_textbook(findings.judgement):
         return findings
-    if not judging.is_beaten_by_textbook(findings.judgement):
-        return findings
+    until = drive.settings.train_until_s
+    offset = findings.calibration.clock_offset_s
     best = findings
     for one_limit in (True, False):
         with suppress(FitError, RecordingError):
-            textbook = _try_textbook(drive, findings, one_limit)
+            yardstick = fitted
+            if one_limit:
+                yardstick = fit_yardstick(findings.whole, until, offset, one_limit)
+            textbook = _try_textbook(drive, findings, yardstick)
             if textbook is not None and _measure_error(textbook) < _measure_error(best):
                 best = textbook
     return best
@@ -553,16 +557,12 @@ def _measure_error(findings: Findings) -> float:
     return min(errors, default=np.inf)
 
 
-def _try_textbook(drive: Drive, findings: Findings, one_limit: bool) -> Findings | None:
-    """Fits the textbook in place of the model, and judges it; None without terms for its state."""
+def _try_textbook(
+    drive: Drive, findings: Findings, yardstick: Yardstick
+) -> Findings | None:
+    """Judges the fitted textbook in place of the model; None without terms for its state."""
     model = require_model(findings)
     spec = drive.spec
-    yardstick = fit_yardstick(
-        findings.whole,
-        drive.settings.train_until_s,
-        findings.calibration.clock_offset_s,
-        one_limit,
-    )
     calibration = make_textbook_calibration(yardstick, findings.calibration, spec)
     start = derive_motion(drive, replace(findings, calibration=calibration))
     is_actuated = needs_actuators(yardstick, spec)

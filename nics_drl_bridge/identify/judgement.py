@@ -418,8 +418,7 @@ def estimate_bands(
     for _, part in folds:
         adjusted = model, calibration
         if derived is not None:
-            begin, end = part.recording.pose.t[[0, -1]] + calibration.clock_offset_s
-            kept = (derived[0].t < begin) | (derived[0].t > end)
+            kept = _select_rows_outside(derived[0], part, calibration)
             adjusted = _adjust_to_rows(model, calibration, training, *derived, kept)
         for horizon, parts in errors.items():
             parts.append(measure_distances(*adjusted, part, horizon))
@@ -429,6 +428,14 @@ def estimate_bands(
         if len(far) >= FEWEST:
             bands[horizon] = float(np.percentile(far, WITHIN))
     return bands
+
+
+def _select_rows_outside(
+    samples: Samples, part: Drive, calibration: Calibration
+) -> NDArray[np.bool_]:
+    """Selects the samples (T,) outside a part of the drive."""
+    begin, end = part.recording.pose.t[[0, -1]] + calibration.clock_offset_s
+    return np.asarray((samples.t < begin) | (samples.t > end))
 
 
 def measure_distances(

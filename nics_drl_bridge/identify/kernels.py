@@ -5,7 +5,7 @@ serves states that follow commands, since `scipy.signal` takes a second to impor
 """
 
 import math
-from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -18,15 +18,41 @@ from nics_drl_bridge.robot.kernels import (
     Terms,
     advance_state,
     get_bounds,
-    make_terms,
-    sum_back_emf,
 )
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-# number of windows predicted at a time, for vector instructions
-WIDTH = 16
-# below this angle the series of sin(a)/a is exact to the last digits [rad]
-SMALL_TURN = 0.3
+# most windows that are predicted at a time, and how many vector instructions take at once
+LANES = 64
+VECTOR = 16
+# below this turn of a step the series of its sine and cosine are exact to the last digits [rad]
+SMALL_TURN = 0.1
+
+
+class TermIndex(NamedTuple):
+    """The used terms of a model, without their coefficients, in the order of their dofs."""
+
+    dof: NDArray[np.int64]  # (K,) degree of freedom of each term
+    factors: NDArray[np.int64]  # (K, order) as in `Terms`
+    degree: NDArray[np.int64]  # (K,)
+    free: NDArray[np.int64]  # (P,) places of the free ones
+
+
+@lru_cache(maxsize=16)  # searches change coefficients, not terms
+def _index_terms(
+    powers: bytes, used: bytes, free: bytes, shape: tuple[int, int]
+) -> TermIndex:
+    """Returns the index of the used ones (D, K) among terms, and the free ones (D, K) of these."""
+    is_used = np.frombuffer(used, np.bool_).reshape(shape)
+    is_free = np.frombuffer(free, np.bool_).reshape(shape)
+    dofs, columns = np.nonzero(is_used)
+    rows = np.frombuffer(powers, np.int64).reshape(shape[1], -1)[columns]
+    degree = rows.sum(axis=1)
+    variables = rows.shape[1]
+    factors = np.full((len(rows), max(1, int(degree.max(initial=1)))), variables)
+    for term, row in zip(factors, rows, strict=True):
+        term[: row.sum()] = np.repeat(np.arange(variables), row)
+    moving = np.flatnonzero(is_free[is_used])
+    return TermIndex(dofs.astype(np.int64), factors, degree, moving.astype(np.int64))
 
 
 def make_used_terms(
@@ -34,19 +60,27 @@ def make_used_terms(
 ) -> tuple[Terms, NDArray[np.int64]]:
     """Returns the used ones (D, K) of a model's terms, and the indices of the free among them.
 
-    A term that is used may have a coefficient of 0.
+    A term that is used may have a coefficient of 0. Commands are taken to be those in effect.
     """
-    terms = make_terms(replace(model, coefficients=used.astype(np.float64)))
-    terms = terms._replace(coefficient=model.coefficients[used])
-    return terms, np.flatnonzero(free[used]).astype(np.int64)
-
-
-@kernel
-def _sinc(half: float) -> float:
-    if abs(half) > SMALL_TURN:
-        return math.sin(half) / half
-    square = half * half
-    return 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
+    powers = model.powers.astype(np.int64).tobytes()
+    index = _index_terms(powers, used.tobytes(), free.tobytes(), used.shape)
+    low, high = model.state_box
+    terms = Terms(
+        dof=index.dof,
+        coefficient=model.coefficients[used],
+        factors=index.factors,
+        degree=index.degree,
+        low=low,
+        high=high,
+        fall=np.ascontiguousarray(model.limits[:, 0]),
+        rise=np.ascontiguousarray(model.limits[:, 1]),
+        friction=model.friction,
+        drag=model.drag,
+        curves=np.zeros((0, 4)),
+        extra_delays=np.zeros(0, dtype=np.int64),
+        emf=model.back_emf if model.back_emf.any() else np.zeros((0, 0)),
+    )
+    return terms, index.free
 
 
 class Shot(NamedTuple):
@@ -62,42 +96,59 @@ class Shot(NamedTuple):
 
 
 class Tangent(NamedTuple):
-    """Scratch memory of L windows: current values, and their derivatives by the free coefficients.
-
-    There is space for a multiple of `WIDTH` coefficients.
-    """
+    """Scratch memory of L windows: current values, and their derivatives by P free coefficients."""
 
     x: Array  # (S + C + 1, L) X and a last entry of 1
     value: Array  # (K, L) of each term without its coefficient
     rate: Array  # (3 + S, L)
-    jacobian: Array  # (3 + S, S, L) of the rates by the state
+    # (3 + S, S, L) of the rates by the state; those of the state by a step, where no limit holds it
+    jacobian: Array
+    depends: NDArray[np.bool_]  # (3 + S, S) True if a rate depends on a state
     rest: Array  # (L,)
-    last: Array  # (L,) steps to the last horizon
-    pose: Array  # (L, 3)
-    state_slope: Array  # (L, S, P)
-    pose_slope: Array  # (L, 3, P)
-    before: Array  # (S, P) slope of a state a step earlier
-    twist: Array  # (3, P) slope
-
-
-def tangent(states: int, commands: int, terms: int, free: int) -> Tangent:
-    """Allocates scratch memory for `shoot`."""
-    lanes = WIDTH
-    free = -(-free // WIDTH) * WIDTH
-    shapes = (
-        (states + commands + 1, lanes),
-        (terms, lanes),
-        (3 + states, lanes),
-        (3 + states, states, lanes),
-        (lanes,),
-        (lanes,),
-        (lanes, 3),
-        (lanes, states, free),
-        (lanes, 3, free),
-        (states, free),
-        (3, free),
+    pose: Array  # (5, L) x, y, heading, and its cosine and sine
+    ahead: Array  # (3, L) way along x and y per vx, and along x per vy, in a step [s]
+    moved: Array  # (3, L) way along x and y, and along x per turn of the start [m]
+    by_turn: Array  # (2, L) way along x and y per turn rate [m s]
+    moves: Array  # (S, L) dt where no limit holds the rate of a state, else 0
+    kept: (
+        Array  # (S, L) factor by which drag shrinks changes of a state; 0 if it sticks
     )
-    return Tangent(*map(np.zeros, shapes))
+    pose_slope: Array  # (P, 3, L)
+    state_slope: Array  # (P, S, L)
+    after: Array  # (S, L) slope of the state a step later
+    twist: Array  # (3, L) slope
+
+
+def allocate_tangent(shot: Shot, terms: Terms, free: int) -> Tangent:
+    """Allocates scratch memory for `shoot`."""
+    windows, states = shot.state.shape
+    blocks = max(1, -(-windows // LANES))
+    lanes = VECTOR * max(1, -(-windows // (VECTOR * blocks)))
+    depends = np.zeros((3 + states, states), dtype=np.bool_)
+    for factors in terms.factors.T:
+        by_state = factors < states
+        depends[terms.dof[by_state], factors[by_state]] = True
+    if terms.emf.size:
+        depends[3:] |= np.eye(states, dtype=np.bool_)
+    sizes: dict[str, tuple[int, ...]] = {
+        "x": (states + shot.command.shape[1] + 1,),
+        "value": (len(terms.dof),),
+        "rate": (3 + states,),
+        "jacobian": (3 + states, states),
+        "rest": (),
+        "pose": (5,),
+        "ahead": (3,),
+        "moved": (3,),
+        "by_turn": (2,),
+        "moves": (states,),
+        "kept": (states,),
+        "pose_slope": (free, 3),
+        "state_slope": (free, states),
+        "after": (states,),
+        "twist": (3,),
+    }
+    memory = {name: np.zeros((*size, lanes)) for name, size in sizes.items()}
+    return Tangent(depends=depends, **memory)
 
 
 @kernel
@@ -108,36 +159,46 @@ def shoot(
     dt: float,
     scratch: Tangent,
 ) -> None:
-    """Predicts windows in steps of dt [s], and the derivatives by the `free` (P,) of `terms`.
-
-    The indices of free terms, and the degrees of freedom of the terms, must ascend.
-    """
-    for begin in range(0, shot.state.shape[0], WIDTH):
-        end = min(begin + WIDTH, shot.state.shape[0])
+    """Predicts windows in steps of dt [s], and the derivatives by the `free` (P,) of `terms`."""
+    lanes = scratch.rest.shape[0]
+    sloped = free.shape[0] > 0
+    for begin in range(0, shot.state.shape[0], lanes):
+        end = min(begin + lanes, shot.state.shape[0])
         for n in range(_begin(shot, begin, end, scratch)):
-            _linearise(terms, free, scratch)
+            _compute_rates(terms, scratch)
+            if sloped:
+                _linearise(terms, scratch)
+            _move(scratch, dt)
+            for i in range(shot.state.shape[1]):
+                if sloped:
+                    _hold_slopes(i, terms, scratch, dt)
+                _advance(scratch.x[i], scratch.rate[3 + i], dt, get_bounds(terms, i))
+            for p in range(free.shape[0]):
+                dof = terms.dof[free[p]]
+                value = scratch.value[free[p]]
+                _follow_twist(scratch.state_slope[p], dof, value, scratch)
+                _follow_pose(scratch.pose_slope[p], dt, scratch)
+                _follow_state(scratch.state_slope[p], dof, value, scratch)
             for w in range(begin, end):
-                if n < scratch.last[w - begin]:
-                    _step(w - begin, terms, free, scratch, dt)
-                    _put(shot, w, n + 1, w - begin, scratch)
+                _put(shot, w, n + 1, w - begin, scratch)
 
 
 @kernel
 def _begin(shot: Shot, begin: int, end: int, scratch: Tangent) -> int:
     """Initialises windows at their starts, and returns the number of steps to the last horizon."""
+    scratch.x[:] = 0.0
     scratch.x[-1] = 1.0
-    last = 0
     scratch.pose[:] = 0.0
+    scratch.pose[3] = 1.0
     scratch.state_slope[:] = 0.0
     scratch.pose_slope[:] = 0.0
+    last = 0
     for w in range(begin, end):
         for i in range(shot.state.shape[1]):
             scratch.x[i, w - begin] = shot.state[w, i]
         _put(shot, w, 0, w - begin, scratch)
-        scratch.last[w - begin] = 0.0
         for h in range(shot.stop.shape[1]):
-            scratch.last[w - begin] = max(scratch.last[w - begin], shot.stop[w, h])
-        last = max(last, int(scratch.last[w - begin]))
+            last = max(last, shot.stop[w, h])
     return last
 
 
@@ -150,197 +211,265 @@ def _put(shot: Shot, w: int, n: int, lane: int, scratch: Tangent) -> None:
     for h in range(shot.stop.shape[1]):
         if n > 0 and shot.stop[w, h] == n:
             for d in range(3):
-                shot.end[w, h, d] = scratch.pose[lane, d]
+                shot.end[w, h, d] = scratch.pose[d, lane]
                 for p in range(shot.slope.shape[3]):
-                    shot.slope[w, h, d, p] = scratch.pose_slope[lane, d, p]
+                    shot.slope[w, h, d, p] = scratch.pose_slope[p, d, lane]
 
 
-@kernel
-def _linearise(terms: Terms, free: NDArray[np.int64], scratch: Tangent) -> None:
-    """Computes the terms and the rates, and their derivatives by the state if any are needed."""
-    states = scratch.state_slope.shape[1]
-    sloped = free.shape[0] > 0
-    scratch.rate[:] = 0.0
-    scratch.jacobian[:] = 0.0
-    for k in range(terms.dof.shape[0]):
-        d = terms.dof[k]
-        coefficient = terms.coefficient[k]
-        factors = terms.factors[k]
-        degree = terms.degree[k]
-        value = scratch.value[k if sloped else 0]
-        rate = scratch.rate[d]
-        _multiply(value, 1.0, factors, degree, -1, scratch.x)
-        for lane in range(rate.shape[0]):
-            rate[lane] += coefficient * value[lane]
-        for f in range(degree if sloped else 0):
-            if factors[f] < states:
-                _multiply(scratch.rest, coefficient, factors, degree, f, scratch.x)
-                slope = scratch.jacobian[d, factors[f]]
-                for lane in range(slope.shape[0]):
-                    slope[lane] += scratch.rest[lane]
-    for i in range(terms.emf.shape[0]):
-        rate = scratch.rate[3 + i]
-        slope = scratch.jacobian[3 + i, i]
-        state = scratch.x[i]
-        for lane in range(rate.shape[0]):
-            braking = sum_back_emf(i, scratch.x[:, lane], terms)
-            rate[lane] -= braking * state[lane]
-            slope[lane] -= braking
-
-
-@kernel
-def _multiply(
-    product: Array,
-    first: float,
-    factors: NDArray[np.int64],
-    degree: int,
-    without: int,
-    x: Array,
-) -> None:
-    """Writes products (L,) of a number and all factors except one."""
-    for lane in range(product.shape[0]):
-        product[lane] = first
-    for f in range(degree):
-        if f != without:
-            factor = x[factors[f]]
-            for lane in range(product.shape[0]):
-                product[lane] *= factor[lane]
-
-
-@kernel(inline=True)
-def _step(
-    lane: int, terms: Terms, free: NDArray[np.int64], scratch: Tangent, dt: float
-) -> None:
-    """Advances a window and its derivatives by a step."""
-    rate = scratch.rate[:, lane]
-    pose = scratch.pose[lane]
-    sloped = free.shape[0] > 0
-    first = _follow_twist(lane, terms, free, scratch) if sloped else 0
-    turn = rate[2] * dt
-    along = dt * _sinc(rate[2] * dt / 2.0)
-    c = math.cos(pose[2] + turn / 2.0)
-    s = math.sin(pose[2] + turn / 2.0)
-    dx = along * (c * rate[0] - s * rate[1])
-    dy = along * (s * rate[0] + c * rate[1])
-    if sloped:
-        shorter = -turn / 12.0 * dt
-        _follow_pose(
-            scratch.pose_slope[lane],
-            scratch.twist,
-            (dx, dy),
-            (along * c, along * s),
-            shorter,
-            dt,
-        )
-    pose[0] += dx
-    pose[1] += dy
-    pose[2] += turn
-    _follow_state(lane, terms, free, first, scratch, dt)
-
-
-@kernel
-def _follow_twist(
-    lane: int, terms: Terms, free: NDArray[np.int64], scratch: Tangent
-) -> int:
-    state = scratch.state_slope[lane]
-    for d in range(3):
-        scratch.twist[d] = 0.0
-        for j in range(state.shape[0]):
-            _add(scratch.twist[d], scratch.jacobian[d, j, lane], state[j])
-    p = 0
-    while p < free.shape[0] and terms.dof[free[p]] < 3:
-        scratch.twist[terms.dof[free[p]], p] += scratch.value[free[p], lane]
-        p += 1
-    return p
+# The following loops are over lanes and short, so that they become vector instructions.
 
 
 @kernel
 def _add(total: Array, factor: float, by: Array) -> None:
-    if factor != 0.0:
-        for p in range(total.shape[0]):
-            total[p] += factor * by[p]
+    for lane in range(total.shape[0]):
+        total[lane] += factor * by[lane]
 
 
 @kernel
-def _follow_pose(
-    pose: Array,
-    twist: Array,
-    moved: tuple[float, float],
-    along: tuple[float, float],
-    shorter: float,
-    dt: float,
-) -> None:
-    """Propagates the derivatives (3, P) of a pose along an arc, from those of its twist (3, P)."""
-    x = pose[0]
-    y = pose[1]
-    heading = pose[2]
-    vx = twist[0]
-    vy = twist[1]
-    wz = twist[2]
-    dx, dy = moved
-    ax, ay = along
-    for p in range(x.shape[0]):
-        lean = heading[p] + 0.5 * dt * wz[p]
-        x[p] += ax * vx[p] - ay * vy[p] - lean * dy + shorter * wz[p] * dx
-    for p in range(x.shape[0]):
-        lean = heading[p] + 0.5 * dt * wz[p]
-        y[p] += ay * vx[p] + ax * vy[p] + lean * dx + shorter * wz[p] * dy
-    for p in range(x.shape[0]):
-        heading[p] += dt * wz[p]
-
-
-@kernel(inline=True)
-def _follow_state(
-    lane: int,
-    terms: Terms,
-    free: NDArray[np.int64],
-    k: int,
-    scratch: Tangent,
-    dt: float,
-) -> None:
-    state = scratch.state_slope[lane]
-    before = scratch.before
-    rate = scratch.rate[:, lane]
-    states, count = state.shape
-    for i in range(states):
-        for p in range(count):
-            before[i, p] = state[i, p]
-    for i in range(states):
-        moves = terms.fall[i] <= rate[3 + i] <= terms.rise[i]
-        now = state[i]
-        for j in range(states if moves and count > 0 else 0):
-            _add(now, dt * scratch.jacobian[3 + i, j, lane], before[j])
-        while k < free.shape[0] and terms.dof[free[k]] == 3 + i:
-            if moves:
-                now[k] += dt * scratch.value[free[k], lane]
-            k += 1
-        bounds = get_bounds(terms, i)
-        x = scratch.x[i]
-        moved = advance_state(x[lane], rate[3 + i], dt, bounds)
-        if count > 0:
-            _hold(now, x[lane], moved, rate[3 + i], dt, bounds)
-        x[lane] = moved
+def _add_product(total: Array, a: Array, b: Array) -> None:
+    for lane in range(total.shape[0]):
+        total[lane] += a[lane] * b[lane]
 
 
 @kernel
-def _hold(
-    slope: Array,
-    value: float,
-    moved: float,
-    rate: float,
-    dt: float,
-    bounds: Bounds,
+def _put_product(product: Array, a: Array, b: Array) -> None:
+    for lane in range(product.shape[0]):
+        product[lane] = a[lane] * b[lane]
+
+
+@kernel
+def _multiply(product: Array, by: Array) -> None:
+    for lane in range(product.shape[0]):
+        product[lane] *= by[lane]
+
+
+@kernel
+def _compute_rates(terms: Terms, scratch: Tangent) -> None:
+    """Computes the terms and the rates."""
+    scratch.rate[:] = 0.0
+    for k in range(terms.dof.shape[0]):
+        value = scratch.value[k]
+        first = scratch.x[terms.factors[k, 0]]
+        if terms.degree[k] < 2:
+            for lane in range(value.shape[0]):
+                value[lane] = first[lane]
+        else:
+            _put_product(value, first, scratch.x[terms.factors[k, 1]])
+        for f in range(2, terms.degree[k]):
+            _multiply(value, scratch.x[terms.factors[k, f]])
+        _add(scratch.rate[terms.dof[k]], terms.coefficient[k], value)
+    states = terms.emf.shape[0]
+    for i in range(states):
+        for c in range(terms.emf.shape[1]):
+            _brake(
+                scratch.rate[3 + i],
+                terms.emf[i, c],
+                scratch.x[states + c],
+                scratch.x[i],
+            )
+
+
+@kernel
+def _brake(rate: Array, emf: float, command: Array, state: Array) -> None:
+    """Subtracts the back-EMF of a command from the rate of a state."""
+    for lane in range(rate.shape[0]):
+        rate[lane] -= emf * abs(command[lane]) * state[lane]
+
+
+@kernel
+def _linearise(terms: Terms, scratch: Tangent) -> None:
+    """Computes the derivatives of the rates by the state."""
+    states = scratch.after.shape[0]
+    scratch.jacobian[:] = 0.0
+    for k in range(terms.dof.shape[0]):
+        factors = terms.factors[k]
+        degree = terms.degree[k]
+        for f in range(degree):
+            if factors[f] < states:
+                slope = scratch.jacobian[terms.dof[k], factors[f]]
+                _multiply_others(scratch.rest, factors, degree, f, scratch.x)
+                _add(slope, terms.coefficient[k], scratch.rest)
+    ones = scratch.x[-1]
+    for i in range(terms.emf.shape[0]):
+        for c in range(terms.emf.shape[1]):
+            slope = scratch.jacobian[3 + i, i]
+            _brake(slope, terms.emf[i, c], scratch.x[states + c], ones)
+
+
+@kernel
+def _multiply_others(
+    product: Array, factors: NDArray[np.int64], degree: int, without: int, x: Array
 ) -> None:
-    """Scales derivatives (P,) of a state by its drag; zeroes them if it sticks or is limited."""
+    """Writes products (L,) of all factors except one."""
+    product[:] = 1.0
+    for f in range(degree):
+        if f != without:
+            _multiply(product, x[factors[f]])
+
+
+@kernel
+def _move(scratch: Tangent, dt: float) -> None:
+    """Moves the poses along arcs; keeps how their ways depend on the twists and headings."""
+    _aim(scratch.ahead, scratch.pose, scratch.rate[2], dt)
+    ahead = scratch.ahead
+    moved = scratch.moved
+    twist = scratch.rate
+    for lane in range(moved.shape[1]):
+        ahead[2, lane] = -ahead[1, lane]
+    for lane in range(moved.shape[1]):
+        moved[0, lane] = (
+            ahead[0, lane] * twist[0, lane] + ahead[2, lane] * twist[1, lane]
+        )
+    for lane in range(moved.shape[1]):
+        moved[1, lane] = (
+            ahead[1, lane] * twist[0, lane] + ahead[0, lane] * twist[1, lane]
+        )
+    for lane in range(moved.shape[1]):
+        moved[2, lane] = -moved[1, lane]
+    _add(scratch.pose[0], 1.0, moved[0])
+    _add(scratch.pose[1], 1.0, moved[1])
+    _add(scratch.pose[2], dt, twist[2])
+    _lean(scratch.by_turn[0], moved[2], moved[0], twist[2], dt)
+    _lean(scratch.by_turn[1], moved[0], moved[1], twist[2], dt)
+
+
+@kernel
+def _aim(ahead: Array, pose: Array, turn_rate: Array, dt: float) -> None:
+    """Computes the way in a step per vx, and the cosine and sine of the next heading."""
+    cosine = pose[3]
+    sine = pose[4]
+    along = ahead[0]
+    aside = ahead[1]
+    largest = 0.0
+    for lane in range(turn_rate.shape[0]):
+        largest = max(largest, abs(turn_rate[lane]))
+    for lane in range(turn_rate.shape[0]):
+        turn = turn_rate[lane] * dt
+        square = turn * turn
+        sinc = 1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square / 5040.0))
+        cosc = turn * (0.5 - square * (1.0 / 24.0 - square / 720.0))
+        along[lane] = dt * (sinc * cosine[lane] - cosc * sine[lane])
+        aside[lane] = dt * (sinc * sine[lane] + cosc * cosine[lane])
+    for lane in range(turn_rate.shape[0]):
+        cosine[lane] -= turn_rate[lane] * aside[lane]
+        sine[lane] += turn_rate[lane] * along[lane]
+    for lane in range(turn_rate.shape[0] if largest * dt > SMALL_TURN else 0):
+        turn = turn_rate[lane] * dt
+        if abs(turn) > SMALL_TURN:
+            before = pose[2, lane]
+            cosine[lane] = math.cos(before + turn)
+            sine[lane] = math.sin(before + turn)
+            along[lane] = (sine[lane] - math.sin(before)) / turn_rate[lane]
+            aside[lane] = (math.cos(before) - cosine[lane]) / turn_rate[lane]
+
+
+@kernel
+def _lean(
+    by_turn: Array, across: Array, along: Array, turn_rate: Array, dt: float
+) -> None:
+    """Computes the way per turn rate: half of it is across, and the chord gets shorter."""
+    for lane in range(by_turn.shape[0]):
+        shorter = dt * dt / 12.0 * turn_rate[lane]
+        by_turn[lane] = 0.5 * dt * across[lane] - shorter * along[lane]
+
+
+@kernel
+def _advance(state: Array, rate: Array, dt: float, bounds: Bounds) -> None:
+    for lane in range(state.shape[0]):
+        state[lane] = advance_state(state[lane], rate[lane], dt, bounds)
+
+
+@kernel
+def _hold_slopes(i: int, terms: Terms, scratch: Tangent, dt: float) -> None:
+    """Computes how limits and drag of a state hold its changes."""
+    bounds = get_bounds(terms, i)
+    rate = scratch.rate[3 + i]
+    moves = scratch.moves[i]
+    for lane in range(rate.shape[0]):
+        moves[lane] = dt if bounds.fall <= rate[lane] <= bounds.rise else 0.0
+    for lane in range(rate.shape[0]):
+        scratch.kept[i, lane] = _keep(scratch.x[i, lane], rate[lane], dt, bounds)
+    for j in range(scratch.after.shape[0]):
+        if scratch.depends[3 + i, j]:
+            slope = scratch.jacobian[3 + i, j]
+            _multiply(slope, moves)
+
+
+@kernel
+def _keep(value: float, rate: float, dt: float, bounds: Bounds) -> float:
+    """Returns the factor by which drag shrinks changes of a state; 0 if it sticks or is limited."""
+    moved = advance_state(value, rate, dt, bounds)
     unheld = value + dt * min(max(rate, bounds.fall), bounds.rise)
     slower = 1.0 + dt * bounds.drag * abs(unheld)
     if slower > 1.0:
         unheld /= slower
-        for p in range(slope.shape[0]):
-            slope[p] /= slower * slower
     unheld -= math.copysign(dt * bounds.friction, unheld)
-    if moved != unheld:
-        slope[:] = 0.0
+    return 1.0 / (slower * slower) if moved == unheld else 0.0
+
+
+@kernel
+def _follow_twist(slopes: Array, dof: int, value: Array, scratch: Tangent) -> None:
+    """Computes the slopes of the twist by a coefficient of a term of a dof."""
+    for d in range(3):
+        twist = scratch.twist[d]
+        twist[:] = 0.0
+        for j in range(slopes.shape[0]):
+            if scratch.depends[d, j]:
+                _add_product(twist, scratch.jacobian[d, j], slopes[j])
+    if dof < 3:
+        _add(scratch.twist[dof], 1.0, value)
+
+
+@kernel
+def _follow_pose(slope: Array, dt: float, scratch: Tangent) -> None:
+    """Propagates the slopes (3, L) of poses along arcs, from those of the twist."""
+    ahead = scratch.ahead
+    moved = scratch.moved
+    by_turn = scratch.by_turn
+    heading = slope[2]
+    _shift(slope[0], ahead[0], ahead[2], moved[2], by_turn[0], scratch.twist, heading)
+    _shift(slope[1], ahead[1], ahead[0], moved[0], by_turn[1], scratch.twist, heading)
+    _add(heading, dt, scratch.twist[2])
+
+
+@kernel
+def _shift(
+    place: Array,
+    per_vx: Array,
+    per_vy: Array,
+    per_heading: Array,
+    per_turn_rate: Array,
+    twist: Array,
+    heading: Array,
+) -> None:
+    """Adds the ways by slopes of the twist (3, L) and of the heading."""
+    vx = twist[0]
+    vy = twist[1]
+    wz = twist[2]
+    for lane in range(place.shape[0]):
+        place[lane] += (
+            per_vx[lane] * vx[lane]
+            + per_vy[lane] * vy[lane]
+            + per_heading[lane] * heading[lane]
+            + per_turn_rate[lane] * wz[lane]
+        )
+
+
+@kernel
+def _follow_state(slopes: Array, dof: int, value: Array, scratch: Tangent) -> None:
+    """Propagates the slopes (S, L) of states by a coefficient of a term of a dof."""
+    states = slopes.shape[0]
+    for i in range(states):
+        after = scratch.after[i]
+        for lane in range(after.shape[0]):
+            after[lane] = slopes[i, lane]
+        for j in range(states):
+            if scratch.depends[3 + i, j]:
+                _add_product(after, scratch.jacobian[3 + i, j], slopes[j])
+        if dof == 3 + i:
+            _add_product(after, scratch.moves[i], value)
+    for i in range(states):
+        _put_product(slopes[i], scratch.after[i], scratch.kept[i])
 
 
 @kernel
@@ -383,6 +512,50 @@ def _twist(state: Array, bicycle: BicycleGeometry) -> tuple[float, float, float]
 
 
 @kernel
+def _keep_lags(share: float, dt: float, lag: Array) -> tuple[float, float, float]:
+    """Returns the shares of their distances from the targets that actuators keep in a step."""
+    span = share * dt
+    return (
+        1.0 / (1.0 + span / lag[0]),
+        1.0 / (1.0 + span / lag[1]),
+        1.0 / (1.0 + span / lag[2]),
+    )
+
+
+@kernel
+def _advance_actuator(
+    state: Array,
+    target: Array,
+    place: float,
+    kept: tuple[float, float, float],
+    lag: Array,
+    limit: Array,
+) -> None:
+    """Moves an actuator (3,) towards its target (G, 3) at a place between rows."""
+    held = min(max(place, 0.0), len(target) - 2.0)
+    k = int(held)
+    for i in range(3):
+        aim = target[k, i] + (held - k) * (target[k + 1, i] - target[k, i])
+        if i == 0:
+            aim = _limited(state[0], aim, lag[0], limit)
+        state[i] = aim + (state[i] - aim) * kept[i]
+
+
+@kernel
+def _rotate_half(half: float) -> tuple[float, float]:
+    """Returns cosine and sine of half the turn of a step."""
+    if abs(half) > SMALL_TURN:
+        return math.cos(half), math.sin(half)
+    square = half * half
+    cosine = 1.0 - square / 30.0 * (1.0 - square / 56.0)
+    sine = 1.0 - square / 42.0 * (1.0 - square / 72.0)
+    return (
+        1.0 - square / 2.0 * (1.0 - square / 12.0 * cosine),
+        half * (1.0 - square / 6.0 * (1.0 - square / 20.0 * sine)),
+    )
+
+
+@kernel
 def roll_windows(
     ends: Array,
     actuator: Array,
@@ -400,30 +573,28 @@ def roll_windows(
     angle of a steered robot; `target` (G, 3) their targets on a grid, `begin` (W,) indices in it;
     `lag` (3,) [s]; `limit` (2,) of the speed's acceleration and deceleration [m/s^2].
     """
+    kept_by_step = _keep_lags(1.0, dt, lag)
     for w in range(len(begin)):
         x = 0.0
         y = 0.0
         heading = 0.0
+        c = 1.0
+        s = 0.0
         done = 0.0
-        state = actuator[w]
         for h in range(stops.shape[1]):
             while done < stops[w, h] - 1e-9:
                 share = min(1.0, stops[w, h] - done)
-                place = min(max(begin[w] + done, 0.0), len(target) - 2.0)
-                k = int(place)
-                for i in range(3):
-                    aim = target[k, i] + (place - k) * (target[k + 1, i] - target[k, i])
-                    if i == 0:
-                        aim = _limited(state[0], aim, lag[0], limit)
-                    state[i] = aim + (state[i] - aim) / (1.0 + share * dt / lag[i])
-                vx, vy, turn = _twist(state, bicycle)
+                kept = kept_by_step if share == 1.0 else _keep_lags(share, dt, lag)
+                place = begin[w] + done
+                _advance_actuator(actuator[w], target, place, kept, lag, limit)
+                vx, vy, turn_rate = _twist(actuator[w], bicycle)
                 span = share * dt
-                middle = heading + 0.5 * turn * span
-                c = math.cos(middle)
-                s = math.sin(middle)
+                cosine, sine = _rotate_half(0.5 * turn_rate * span)
+                c, s = c * cosine - s * sine, s * cosine + c * sine  # half-way
                 x += span * (c * vx - s * vy)
                 y += span * (s * vx + c * vy)
-                heading += turn * span
+                c, s = c * cosine - s * sine, s * cosine + c * sine
+                heading += turn_rate * span
                 done += share
             ends[w, h, 0] = x
             ends[w, h, 1] = y

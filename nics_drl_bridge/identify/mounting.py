@@ -111,23 +111,15 @@ def estimate_mounting_by_instruments(
     motion: TwistIntervals, states: Array, forward: Array, spec: RobotSpec
 ) -> Mounting | None:
     """Estimates the mounting by instruments from the states (n, S); None if these are too weak."""
-    # The states are independent of the twists' noise, and what they do along x they do not do along
-    # y: limited-information maximum likelihood (Anderson, Rubin 1949).
     powers = taylor.list_exponents(states.shape[1], MAX_ORDER)
     chi = taylor.evaluate(
         states / np.maximum(np.abs(states).max(axis=0), STILL), powers
     )
     basis = scipy.linalg.orth(chi, rcond=SAME)
-    count, size = basis.shape
     seen = basis @ (basis.T @ motion.twist)
-    noise = (motion.twist - seen).T @ (motion.twist - seen)
-    power = seen.T @ seen
-    noise += RIDGE * np.trace(power + noise) * np.eye(3)
-    strength, axes = scipy.linalg.eigh(power, noise)
-    flat = float(np.hypot(*axes[:2, 0]) / np.linalg.norm(axes[:, 0]))
-    if not strength[1] * (count - size) / size > STRONG or flat < FLAT:
+    normal = _find_still_direction(motion.twist, seen, basis.shape[1])
+    if normal is None:
         return None
-    normal = axes[:, 0] / np.hypot(*axes[:2, 0])
     if float(motion.twist[:, :2] @ [normal[1], -normal[0]] @ forward) < 0.0:
         normal = -normal
     travel = float(np.arctan2(-normal[0], normal[1]))
@@ -137,24 +129,41 @@ def estimate_mounting_by_instruments(
     )
     if CERTAIN * sigma[1] > spec.footprint_radius:
         return None
-    across = 0.0
-    across_sigma = np.nan
     odd = list_reversed_variables(spec) or ()
     aside = powers[:, [v.name in odd for v in spec.state]].sum(axis=1) % 2 == 1
+    across = 0.0, np.nan
     if aside.any():  # motion along x is even in what a mirror reverses
         even = np.hstack([scipy.linalg.orth(chi[:, ~aside], rcond=SAME), seen[:, 2:]])
-        along = rotate(motion.twist[:, :2], -travel)[:, 0]
-        beta = np.linalg.lstsq(even, along, rcond=None)[0]
-        rest = along - even[:, :-1] @ beta[:-1] - beta[-1] * motion.twist[:, 2]
-        across = -float(beta[-1])
-        across_sigma = float(estimate_standard_errors(even, rest)[-1])
-    return Mounting(
-        travel,
-        np.array([-normal[2], across]),
-        float(sigma[0]),
-        np.array([sigma[1], across_sigma]),
-        2,
-    )
+        across = _estimate_lever_by_mirror(motion, travel, even)
+    lever, lever_sigma = np.transpose([(-normal[2], sigma[1]), across])
+    return Mounting(travel, lever, float(sigma[0]), lever_sigma, 2)
+
+
+def _find_still_direction(twist: Array, seen: Array, size: int) -> Array | None:
+    """Returns the direction (3,) in which twists (n, 3) have no extent, by `size` instruments.
+
+    `seen` (n, 3) is what the instruments explain of them. None if the instruments are too weak.
+    """
+    # The states are independent of the twists' noise, and what they do along x they do not do along
+    # y: limited-information maximum likelihood (Anderson, Rubin 1949).
+    noise = (twist - seen).T @ (twist - seen)
+    power = seen.T @ seen
+    noise += RIDGE * np.trace(power + noise) * np.eye(3)
+    strength, axes = scipy.linalg.eigh(power, noise)
+    flat = float(np.hypot(*axes[:2, 0]) / np.linalg.norm(axes[:, 0]))
+    if not strength[1] * (len(twist) - size) / size > STRONG or flat < FLAT:
+        return None
+    return np.asarray(axes[:, 0] / np.hypot(*axes[:2, 0]))
+
+
+def _estimate_lever_by_mirror(
+    motion: TwistIntervals, travel: float, even: Array
+) -> tuple[float, float]:
+    """Returns the lever arm along y and its error from features (n, K), the last the turn rate."""
+    along = rotate(motion.twist[:, :2], -travel)[:, 0]
+    beta = np.linalg.lstsq(even, along, rcond=None)[0]
+    rest = along - even[:, :-1] @ beta[:-1] - beta[-1] * motion.twist[:, 2]
+    return -float(beta[-1]), float(estimate_standard_errors(even, rest)[-1])
 
 
 def estimate_mounting_with_slip(
@@ -234,13 +243,8 @@ def estimate_mounting_without_lateral_motion(
     size = size / np.sqrt(len(rows))
     if size[0] < STILL:
         return None
-    turn = motion.twist[:, 2]
     lever = 0.0
     lever_sigma = np.nan
-    certain = np.abs(turn) > CERTAIN * np.sqrt(2.0) * noise / (
-        motion.end - motion.start
-    )
-    ways = _count_ways(turn, certain)
     if size[1] < max(DISTINCT * size[2], MIN_SECOND * size[0]):
         sigma = size[1] / size[0] / np.sqrt(len(rows))
         travel = float(np.arctan2(axes[0, 1], axes[0, 0]))
@@ -262,8 +266,15 @@ def estimate_mounting_without_lateral_motion(
         np.array([lever, 0.0]),
         float(sigma),
         np.array([lever_sigma, np.nan]),
-        ways,
+        _count_turns(motion, noise),
     )
+
+
+def _count_turns(motion: TwistIntervals, noise: float) -> int:
+    """Counts the ways in which a robot turned beyond the noise of its heading [rad]."""
+    turn = motion.twist[:, 2]
+    span = motion.end - motion.start
+    return _count_ways(turn, np.abs(turn) > CERTAIN * np.sqrt(2.0) * noise / span)
 
 
 def estimate_lateral_lever(
@@ -318,11 +329,7 @@ def estimate_mounting_by_twists(
     if size[2] <= MIN_SECOND * size[0]:
         return None
     gain = np.linalg.lstsq(expected, motion.twist, rcond=None)[0]
-    rest = motion.twist - expected @ gain
-    edges = np.linspace(motion.start[0], motion.end[-1], BLOCKS + 1)
-    block = np.searchsorted(edges[1:-1], motion.start, "right")
-    errors = [estimate_clustered_errors(expected, column, block) for column in rest.T]
-    sigma = np.stack(errors, axis=1)  # of the gain
+    sigma = _estimate_gain_errors(motion, expected, motion.twist - expected @ gain)
     sine = gain[0, 1] - gain[1, 0]  # both times twice the factor
     cosine = gain[0, 0] + gain[1, 1]
     sine_sigma = np.hypot(sigma[0, 1], sigma[1, 0])
@@ -338,6 +345,19 @@ def estimate_mounting_by_twists(
         np.full(2, float(sigma[2, :2].max() / abs(gain[2, 2]))),
         2,
     )
+
+
+def _estimate_gain_errors(
+    motion: TwistIntervals, expected: Array, rest: Array
+) -> Array:
+    """Returns the standard errors (3, 3) of the gain of the expected twists (n, 3).
+
+    `rest` (n, 3) is what the gain leaves of the measured ones.
+    """
+    edges = np.linspace(motion.start[0], motion.end[-1], BLOCKS + 1)
+    block = np.searchsorted(edges[1:-1], motion.start, "right")
+    errors = [estimate_clustered_errors(expected, column, block) for column in rest.T]
+    return np.stack(errors, axis=1)
 
 
 def _predict_twists(spec: RobotSpec, command: Array) -> Array:

@@ -76,11 +76,7 @@ def select_windows(
             first, drive.recording.command.t[0] - calibration.clock_offset_s + SETTLE_S
         )
     begin = np.flatnonzero((t >= first) & (t + horizon <= origin + stop + period / 2.0))
-    chosen: list[int] = []
-    for k in begin:
-        if not chosen or t[k] - t[chosen[-1]] > 0.9 * spacing:
-            chosen.append(int(k))
-    begin = np.array(chosen, dtype=np.intp)
+    begin = begin[_select_apart(t[begin], 0.9 * spacing)]
     after = np.clip(np.searchsorted(t, t[begin] + horizon), 1, len(t) - 1)
     before_is_nearer = t[begin] + horizon - t[after - 1] < t[after] - t[begin] - horizon
     end = after - before_is_nearer
@@ -94,6 +90,15 @@ def select_windows(
     return Windows(
         t[begin], t[end], pose[begin], pose[end], length[end] - length[begin]
     )
+
+
+def _select_apart(t: Array, least: float) -> list[int]:
+    """Returns the rows of times (T,) that are more than the least time apart [s]."""
+    chosen: list[int] = []
+    for row, time in enumerate(t.tolist()):
+        if not chosen or time - t[chosen[-1]] > least:
+            chosen.append(row)
+    return chosen
 
 
 def predict(
@@ -140,7 +145,7 @@ def _by_windows(
         poses = _integrate_twists(rates[..., :3], model.dt)
     else:
         states = resample_states(drive, calibration, begin)
-        poses, _ = roll(model, states, command)
+        poses = roll(model, states, command)[0]
     steps = np.floor(length + 1e-6).astype(np.intp)
     share = np.clip(length - steps, 0.0, 1.0)[:, None]
     window = np.arange(len(begin))

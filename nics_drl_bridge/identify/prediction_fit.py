@@ -26,7 +26,7 @@ from nics_drl_bridge.identify.findings import (
     require_samples,
     resample_drive,
 )
-from nics_drl_bridge.identify.fit import ORDER
+from nics_drl_bridge.identify.fit import ORDER, Order
 from nics_drl_bridge.identify.forms import Evidence
 from nics_drl_bridge.identify.terms import (
     Kind,
@@ -48,20 +48,12 @@ TOO_SHORT = (
 def fit_by_predictions(drive: Drive, findings: Findings) -> Findings:
     """Fits the order that best predicts parts of the training part that its fits did not see."""
     training = findings.training
-    spec = drive.spec
     order = drive.settings.order
     library = make_library(drive, findings)
     samples = resample_drive(training, findings)
     evidence = Evidence(training, findings.calibration, samples, library)
     try:
-        if findings.base is None:
-            base = hypotheses.fit_base(evidence, findings.clear_curves)
-        else:
-            base = hypotheses.refit_base(evidence, findings.base)
-        trials = findings.trials  # a refit reuses the choice
-        trials = trials or base.draft.cross_validate(
-            hypotheses.list_hypotheses(order, library)
-        )
+        base, trials = _fit_base(findings, evidence, order)
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
     best = hypotheses.choose_trial(trials, order)
@@ -74,7 +66,7 @@ def fit_by_predictions(drive: Drive, findings: Findings) -> Findings:
         samples = base.draft.select(None)
     fit = library.fit(samples, best.order or library.order)
     if drive.settings.strict:
-        verdict.refuse_unexcited(fit.regression.excitation, spec)
+        verdict.refuse_unexcited(fit.regression.excitation, drive.spec)
     return replace(
         findings,
         samples=samples,
@@ -84,6 +76,18 @@ def fit_by_predictions(drive: Drive, findings: Findings) -> Findings:
         trials=trials,
         base=base,
     )
+
+
+def _fit_base(
+    findings: Findings, evidence: Evidence, order: Order
+) -> tuple[hypotheses.Base, tuple[hypotheses.Trial, ...]]:
+    """Fits the base, and tries orders of terms beyond it; a refit reuses both choices."""
+    if findings.base is None:
+        base = hypotheses.fit_base(evidence, findings.clear_curves)
+    else:
+        base = hypotheses.refit_base(evidence, findings.base)
+    asked = hypotheses.list_hypotheses(order, evidence.library)
+    return base, findings.trials or base.draft.cross_validate(asked)
 
 
 def make_library(drive: Drive, findings: Findings) -> Library:
@@ -117,14 +121,9 @@ def refine_by_predictions(drive: Drive, findings: Findings) -> Findings:
             found, has_order = _search_model(draft, base, terms, best)
     if draft.library.kind is not Kind.MOTION:
         found = draft.prune(found, drive.settings.alpha)
-    before = draft.form.find_latency(found.named)
+    before_s = draft.form.find_latency(found.named)
     calibration = draft.calibrate(found, calibration)
-    # The calibration has the mounting now.
-    is_mounting = np.isin(found.names, hypotheses.MOUNTING)
-    parameters = draft.problem.parameters
-    parameters = replace(parameters, start=np.where(is_mounting, 0.0, found.values))
-    parameters = parameters.shift_stamps(before - calibration.command_latency_s)
-    draft = replace(draft, problem=replace(draft.problem, parameters=parameters))
+    draft = _start_calibrated(draft, found, before_s - calibration.command_latency_s)
     base = replace(base, draft=draft)
     if draft.library.kind is Kind.MOTION:
         calibration, sums = _separate_lags(base, calibration, drive.spec)
@@ -146,6 +145,20 @@ def refine_by_predictions(drive: Drive, findings: Findings) -> Findings:
             *_list_unused_options(drive, draft.library, best.order, has_order),
         ),
     )
+
+
+def _start_calibrated(
+    draft: hypotheses.Draft, found: shooting.Predictive, latency_s: float
+) -> hypotheses.Draft:
+    """Returns a draft that starts from the values found, less what the calibration has of them.
+
+    That is the mounting, and a part of the latency [s].
+    """
+    is_mounting = np.isin(found.names, hypotheses.MOUNTING)
+    parameters = draft.problem.parameters
+    parameters = replace(parameters, start=np.where(is_mounting, 0.0, found.values))
+    parameters = parameters.shift_stamps(latency_s)
+    return replace(draft, problem=replace(draft.problem, parameters=parameters))
 
 
 def _add_sums(

@@ -33,7 +33,12 @@ from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.recording.recording import HeadingKeys, Recording
 from nics_drl_bridge.recording.stamping import select_new_rows
 from nics_drl_bridge.robot.kinds import has_textbook, slips, textbook
-from nics_drl_bridge.robot.spec import FARTHEST_STEERED, RobotSpec
+from nics_drl_bridge.robot.spec import (
+    FARTHEST_STEERED,
+    CommandVariable,
+    RobotSpec,
+    StateVariable,
+)
 
 # number of samples on either side whose median difference measures a jump
 NEIGHBOURS = 3
@@ -135,14 +140,8 @@ def _drop_held_poses(drive: Drive, notes: list[str]) -> recordings.Recording:
         return recording
     reach = REACH * _find_largest_speed(drive.spec) * np.diff(t)
     leap = np.hypot(*np.diff(pose[:, :2], axis=0).T)
-    moved = np.append(True, (pose[1:] != pose[:-1]).any(axis=1))
-    # Each run of equal poses begins with one that moved, and ends before the next.
-    begins = np.flatnonzero(moved)
-    ends = np.append(begins[1:], len(t)) - 1
     kept = np.ones(len(t), dtype=np.bool_)
-    for begin, end in zip(begins, ends, strict=True):
-        if end == begin or t[end] - t[begin] < HELD_S:
-            continue
+    for begin, end in _find_held_poses(t, pose):
         span = f"from {t[begin] - t[0]:.1f} s to {t[end] - t[0]:.1f} s"
         finding = f"The pose keeps one value {span}"
         if end < len(t) - 1:
@@ -151,13 +150,28 @@ def _drop_held_poses(drive: Drive, notes: list[str]) -> recordings.Recording:
             cause = "as if tracking was lost: these rows were left out"
             # another note reports the gap
             notes.append(f"{finding} and then leaps by {leap[end]:.2f} m, {cause}.")
-        elif moved[:begin].all() and _asks_to_move(drive, float(t[begin])):
+        elif _is_first_stop(pose, begin) and _asks_to_move(drive, float(t[begin])):
             cause = "though commands ask the robot to move, as if tracking was lost"
             notes.append(Gap(f"{finding}, {cause}: the drive ends there."))
         else:
             continue
         kept[begin + 1 : end + 1] = False
     return recording if kept.all() else _select_rows(recording, "pose", kept)
+
+
+def _find_held_poses(t: Array, pose: Array) -> list[tuple[int, int]]:
+    """Returns first and last rows of poses (T, 3) that keep one value for a while."""
+    # Each run of equal poses begins with one that moved, and ends before the next.
+    moved = np.append(True, (pose[1:] != pose[:-1]).any(axis=1))
+    begins = np.flatnonzero(moved)
+    ends = np.append(begins[1:], len(t)) - 1
+    runs = zip(begins.tolist(), ends.tolist(), strict=True)
+    return [(a, b) for a, b in runs if b > a and t[b] - t[a] >= HELD_S]
+
+
+def _is_first_stop(pose: Array, begin: int) -> bool:
+    """True if poses (T, 3) changed from row to row up to one."""
+    return bool(np.diff(pose[:begin], axis=0).any(axis=1).all())
 
 
 def _asks_to_move(drive: Drive, after_s: float) -> bool:
@@ -237,20 +251,26 @@ def _join_at_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
     if not jump.any() or jump.mean() > MOST_JUMPS:
         return recording
     joined = pose.copy()
-    descriptions = []
     for k in np.flatnonzero(jump):
         here = geometry.compose(joined[k], geometry.exp(expected[k]))
         after = geometry.between(joined[k + 1], joined[k + 1 :])
         joined[k + 1 :] = geometry.compose(here, after)
-        size = f"{apart[0, k]:.2f} m, {apart[1, k]:.2f} rad"
-        descriptions.append(f"at {t[k + 1] - t[0]:.2f} s ({size})")
+    notes.append(_describe_jumps((t - t[0])[1:][jump], apart[:, jump]))
+    return replace(recording, pose=replace(recording.pose, values=joined))
+
+
+def _describe_jumps(t: Array, apart: Array) -> Gap:
+    """Describes jumps of a pose at times (J,) [s], by distances (2, J) in m and rad."""
+    descriptions = [
+        f"at {time:.2f} s ({distance:.2f} m, {angle:.2f} rad)"
+        for time, distance, angle in zip(t, *apart, strict=True)
+    ]
     places = ", ".join(descriptions[:MOST_LISTED])
     if len(descriptions) > MOST_LISTED:
         places += f" and {len(descriptions) - MOST_LISTED} more"
     finding = f"jumps {places} as no speed of this robot explains"
     split = "the drive is split there and continues from where it was before"
-    notes.append(Gap(f"pose: {finding}; {split}."))
-    return replace(recording, pose=replace(recording.pose, values=joined))
+    return Gap(f"pose: {finding}; {split}.")
 
 
 def _compare_steps(t: Array, pose: Array) -> tuple[Array, Array]:
@@ -358,23 +378,9 @@ def check_units(drive: Drive) -> None:
     """Refuses states and commands, with a RecordingError, that only another unit can explain."""
     recording = drive.recording
     spec = drive.spec
-    for stream, variables in (
-        (recording.command, spec.command),
-        (recording.state, spec.state),
-    ):
-        if stream is None:
-            continue
-        sizes = np.percentile(np.abs(stream.values), UNIT_PERCENTILE, axis=0)
-        for variable, size in zip(variables, sizes, strict=True):
-            limit = max(abs(variable.min), abs(variable.max))
-            if size > WRONG_UNIT * limit:
-                name = f"{recording.source}: {variable.name}"
-                unit = variable.unit
-                fault = f"is {size:.4g} or more, but its limit is {limit:g} {unit}"
-                causes = "degrees, millimetres or revolutions per minute look like this"
-                raise RecordingError(
-                    f"{name} {fault}; it must be in {unit} ({causes})."
-                )
+    _refuse_other_unit(recording, recording.command, spec.command)
+    if recording.state is not None:
+        _refuse_other_unit(recording, recording.state, spec.state)
     for variable, column in zip(spec.command, recording.command.values.T, strict=True):
         size = float(np.percentile(np.abs(column), STEERED_PERCENTILE))
         if variable.steers and size > FARTHEST_STEERED:
@@ -384,6 +390,23 @@ def check_units(drive: Drive) -> None:
             line = f"{variable.name}: {{from: ..., unit: deg}}"
             advice = f"write `{line}` for degrees, or a `scale:` for a steering wheel"
             raise RecordingError(f"{recording.source}: {fault}; {advice}.")
+
+
+def _refuse_other_unit(
+    recording: Recording,
+    stream: recordings.Stream,
+    variables: tuple[CommandVariable, ...] | tuple[StateVariable, ...],
+) -> None:
+    """Refuses variables of a stream that are far beyond their limits (RecordingError)."""
+    sizes = np.percentile(np.abs(stream.values), UNIT_PERCENTILE, axis=0)
+    for variable, size in zip(variables, sizes, strict=True):
+        limit = max(abs(variable.min), abs(variable.max))
+        if size > WRONG_UNIT * limit:
+            name = f"{recording.source}: {variable.name}"
+            unit = variable.unit
+            fault = f"is {size:.4g} or more, but its limit is {limit:g} {unit}"
+            causes = "degrees, millimetres or revolutions per minute look like this"
+            raise RecordingError(f"{name} {fault}; it must be in {unit} ({causes}).")
 
 
 def check_commands(
@@ -405,22 +428,30 @@ def check_commands(
     places = _find_places(spec)
     if len(places) == 2:
         _check_swapped(drive, [0, 1], min(alike[0, 1], alike[1, 0]), np.trace(alike))
+    ratios = asked.std(axis=0) / np.maximum(driven.std(axis=0), 1e-9)
+    return tuple(_describe_scales(spec, ratios, np.diag(alike)))
+
+
+def _describe_scales(spec: RobotSpec, ratios: Array, alike: Array) -> Iterator[str]:
+    """Yields sentences on speed and turn rate whose ratios (2,) to the measured ones are odd.
+
+    Ratios mean nothing where commands and motion are not `alike` (2,).
+    """
+    places = _find_places(spec)
     commands = [(c.name, c.unit) for c in spec.command]
     if not places:  # wheels
         places = [0]
         commands = [("speed", "rad/s")]
-    notes = list[str]()
     for place, (name, unit) in zip(places, commands, strict=True):
         # a steering angle is not comparable with a turn rate
-        if alike[place, place] <= ALIKE or unit not in CONFUSED:
+        if alike[place] <= ALIKE or unit not in CONFUSED:
             continue
-        ratio = float(asked[:, place].std() / max(driven[:, place].std(), 1e-9))
+        ratio = float(ratios[place])
         is_turn = unit == "rad/s" and len(places) == 2
         if is_turn and slips(spec) and SCALED < ratio < MOST_SKID:
-            notes.append(_describe_skid(spec, ratio))
+            yield _describe_skid(spec, ratio)
         else:
-            notes += _describe_ratio(name, unit, ratio)
-    return tuple(notes)
+            yield from _describe_ratio(name, unit, ratio)
 
 
 def _describe_skid(spec: RobotSpec, ratio: float) -> str:
@@ -474,8 +505,8 @@ def check_encoders(drive: Drive) -> tuple[str, ...]:
     if not has_textbook(spec):
         return ()
     has_state = drive.recording.state is not None
-    units = [v.unit for v in (spec.state if has_state else spec.command)]
-    if {*units} != {"rad/s"}:
+    variables = spec.state if has_state else spec.command
+    if {v.unit for v in variables} != {"rad/s"}:
         return ()
     wheels = _average_inputs(drive, drive.dated.values)
     if wheels is None:
@@ -484,26 +515,33 @@ def check_encoders(drive: Drive) -> tuple[str, ...]:
         book = textbook(spec)
     except ConfigError:
         return ()
-    turned, driven = wheels
-    unit_speeds = np.eye(turned.shape[1])
+    unit_speeds = np.eye(len(variables))
     if has_state:
-        names = [v.name for v in spec.state]
         per_wheel = book.twist(unit_speeds)  # (wheels, 3)
         fault = "its encoder counts backwards"
     else:
-        names = [c.name for c in spec.command]
         per_wheel = book.compute_twist(unit_speeds)
         fault = "its sign is reversed, as if its encoder counts backwards"
+    finding = "turns backwards where the robot drives ahead"
+    return tuple(
+        Mistake(f"{variables[i].name} {finding}: {fault}; write `scale: -1` for it.")
+        for i in _find_reversed_wheels(*wheels, per_wheel)
+    )
+
+
+def _find_reversed_wheels(
+    turned: Array, driven: Array, per_wheel: Array
+) -> NDArray[np.intp]:
+    """Returns the wheels, of those that turned (n, wheels), whose effect has the wrong sign.
+
+    `driven` (n, 3) are the twists meanwhile, `per_wheel` (wheels, 3) those that they should cause.
+    """
     effect, explained = _explain_motion(turned, driven)
     dofs = [d for d in (0, 2) if np.abs(per_wheel[:, d]).min() > 0.0]
     if not dofs or explained[dofs].min() < SWAPPED:
-        return ()
+        return np.zeros(0, dtype=np.intp)
     is_reversed = (effect[:, dofs] * per_wheel[:, dofs] < 0.0).all(axis=1)
-    finding = "turns backwards where the robot drives ahead"
-    return tuple(
-        Mistake(f"{names[i]} {finding}: {fault}; write `scale: -1` for it.")
-        for i in np.flatnonzero(is_reversed)
-    )
+    return np.flatnonzero(is_reversed)
 
 
 def _explain_motion(sent: Array, driven: Array) -> tuple[Array, Array]:
@@ -573,20 +611,31 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]
         average_held(command, spec, start - delay, end - delay)[:, order]
         for delay in DELAYS_S
     ]
-    asked, best = _find_most_alike(trials, driven)
-    _refuse_swapped_sideways(drive, order, best)
-    # a rotated mounting moves the sensor sideways
-    chi = np.column_stack([asked, driven[:, 2]])
-    way = np.linalg.lstsq(chi, driven[:, :2], rcond=None)[0]
-    if np.linalg.det(best[:2, :2]) > -(SWAPPED**2) or np.linalg.det(way[:2]) > 0.0:
+    asked, alike = _find_most_alike(trials, driven)
+    _refuse_swapped_sideways(drive, order, alike)
+    if not _is_mirrored(asked, driven, alike):
         return ()
     ahead, left = (spec.command[k].name for k in order[:2])
+    return (_describe_mirrored(ahead, left),)
+
+
+def _describe_mirrored(ahead: str, left: str) -> Mistake:
+    """Describes that a robot moves as the mirror image of its commands ahead and left."""
     finding = (
         f"The robot moves right where {left} is positive, or back where {ahead} is"
     )
     cause = "one of them has the wrong sign, or the recording is a mirror image"
     consequence = "(y and heading reversed); the model moves as recorded"
-    return (Mistake(f"{finding}: {cause} {consequence}."),)
+    return Mistake(f"{finding}: {cause} {consequence}.")
+
+
+def _is_mirrored(asked: Array, driven: Array, alike: Array) -> bool:
+    """True if a robot moves (n, 3) as the mirror image of what was asked (n, 3) would."""
+    # a rotated mounting moves the sensor sideways
+    chi = np.column_stack([asked, driven[:, 2]])
+    way = np.linalg.lstsq(chi, driven[:, :2], rcond=None)[0]
+    is_opposite = np.linalg.det(alike[:2, :2]) <= -(SWAPPED**2)
+    return bool(is_opposite and np.linalg.det(way[:2]) <= 0.0)
 
 
 def _refuse_swapped_sideways(drive: Drive, order: list[int], alike: Array) -> None:

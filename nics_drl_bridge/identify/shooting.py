@@ -6,13 +6,19 @@ commands; the derivatives of its end by the coefficients are computed along the 
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.kernels import Shot, make_used_terms, shoot, tangent
+from nics_drl_bridge.identify.kernels import (
+    Shot,
+    allocate_tangent,
+    make_used_terms,
+    shoot,
+)
 from nics_drl_bridge.identify.open_loop import put_states
 from nics_drl_bridge.identify.statistics import (
     estimate_clustered_covariance,
@@ -174,26 +180,20 @@ class Shooting:
     ) -> tuple[Array, Array]:
         """Returns poses (W, H, 3), derivatives (W, H, 3, P) by the `free` (D, K) coefficients."""
         at = self.parameters.name(values)
-        model = self.shape(model, at)
         state = self.samples.q[:, 3:] if self.inferred is None else self.inferred(at)
+        command = self.commands(at)
         if free is None:
             free = np.zeros(model.coefficients.shape, dtype=np.bool_)
-        used = (model.coefficients != 0.0) | free
-        terms, moving = make_used_terms(model, used, free)
-        command = self.commands(at)
-        shot = Shot(
-            np.ascontiguousarray(state[first]),
-            first,
-            np.ascontiguousarray(command),
-            steps,
-            np.zeros((*steps.shape, 3)),
-            np.zeros((*steps.shape, 3, len(moving))),
-        )
-        sizes = state.shape[1], command.shape[1], len(terms.dof), len(moving)
-        shoot(shot, terms, moving, model.dt, tangent(*sizes))
+        if self.inferred is None and state.shape[1]:
+            model = self.shape(model, at)
+            end, slope = _predict_windows(model, state, command, first, steps, free)
+        else:  # no state depends on where a window starts, nor does a shape affect the twist
+            x = np.concatenate([state, command], axis=1)
+            end, slope = predict_along_path(model, x, first, steps, free)
         if self.is_mounted:
-            return _mount_poses(np.array([at["x"], at["y"], at["heading"]]), shot)
-        return shot.end, shot.slope
+            mounting = np.array([at["x"], at["y"], at["heading"]])
+            return _mount_poses(mounting, end, slope)
+        return end, slope
 
     def resample(self, values: Array) -> Samples:
         """Returns the samples with the commands in effect, and with inferred states."""
@@ -226,33 +226,161 @@ class Shooting:
         return float(np.nanmean(np.hypot(error[..., 0], error[..., 1])))
 
 
-def _mount_poses(mounting: Array, shot: Shot) -> tuple[Array, Array]:
+def _predict_windows(
+    model: TaylorModel,
+    state: Array,
+    command: Array,
+    first: Rows,
+    steps: Rows,
+    free: Mask,
+) -> tuple[Array, Array]:
+    """Rolls a model out from the first state of each window; see `Shooting.predict`."""
+    used = (model.coefficients != 0.0) | free
+    terms, moving = make_used_terms(model, used, free)
+    shot = Shot(
+        np.ascontiguousarray(state[first]),
+        first,
+        np.ascontiguousarray(command),
+        steps,
+        np.zeros((*steps.shape, 3)),
+        np.zeros((*steps.shape, 3, len(moving))),
+    )
+    scratch = allocate_tangent(shot, terms, len(moving))
+    shoot(shot, terms, moving, model.dt, scratch)
+    return shot.end, shot.slope
+
+
+def predict_along_path(
+    model: TaylorModel, x: Array, first: Rows, steps: Rows, free: Mask
+) -> tuple[Array, Array]:
+    """Predicts windows from one path through all X (T, V), if only the twist has free terms.
+
+    Returns the same as `Shooting.predict`.
+    """
+    chi = _evaluate_terms(x, model.powers)
+    path = _Path.along(model.coefficients[:3] @ chi, model.dt)
+    last = first[:, None] + steps
+    moved = path.pose[:, last] - path.pose[:, first][..., None]
+    slopes = []
+    for dof in range(3):
+        slope = path.differentiate(chi[free[dof]], dof)
+        # How the heading changes before a window does not count in it.
+        turned = slope[:, 2, first][..., None]
+        slope = slope[..., last] - slope[..., first][..., None]
+        slope[:, 0] += turned * moved[1]
+        slope[:, 1] -= turned * moved[0]
+        slopes.append(slope)
+    heading = path.pose[2, first][:, None]
+    end = _turn_back(moved[None], heading)[0]
+    slope = _turn_back(np.concatenate(slopes), heading)
+    return np.moveaxis(end, 0, -1), np.moveaxis(slope, (0, 1), (-1, -2))
+
+
+def _evaluate_terms(x: Array, powers: NDArray[np.int64]) -> Array:
+    """Returns the terms (K, T) of X (T, V)."""
+    columns = np.ascontiguousarray(x.T)
+    chi = np.ones((len(powers), len(x)))
+    for term, row in zip(chi, powers, strict=True):
+        for variable in np.repeat(np.arange(len(row)), row):
+            term *= columns[variable]
+    return chi
+
+
+def _turn_back(moved: Array, heading: Array) -> Array:
+    """Returns motions (n, 3, W, H) as seen from headings (W, 1)."""
+    c = np.cos(heading)
+    s = np.sin(heading)
+    x = c * moved[:, 0] + s * moved[:, 1]
+    y = c * moved[:, 1] - s * moved[:, 0]
+    return np.stack([x, y, moved[:, 2]], axis=1)
+
+
+@dataclass(frozen=True)
+class _Path:
+    """A path by known twists."""
+
+    pose: Array  # (3, T + 1) from the origin; the heading is unwrapped
+    turn: Array  # (T,) by each step [rad]
+    ahead: Array  # (2, T) way of a step per unit of vx [s]
+    dt: float
+
+    @classmethod
+    def along(cls, twist: Array, dt: float) -> "_Path":
+        """Integrates twists (3, T) along arcs over steps of dt [s]."""
+        turn = dt * twist[2]
+        heading = np.append(0.0, np.cumsum(turn))
+        middle = heading[:-1] + turn / 2.0
+        chord = dt * np.sinc(turn / (2.0 * np.pi))
+        ahead = chord * np.stack([np.cos(middle), np.sin(middle)])
+        aside = np.stack([-ahead[1], ahead[0]])
+        place = np.cumsum(twist[0] * ahead + twist[1] * aside, axis=1)
+        pose = np.concatenate([np.zeros((2, 1)), place], axis=1)
+        return cls(np.concatenate([pose, heading[None]]), turn, ahead, dt)
+
+    def differentiate(self, chi: Array, dof: int) -> Array:
+        """Returns derivatives (P, 3, T + 1) by the coefficients of terms (P, T) of a dof."""
+        slope = np.zeros((len(chi), 3, self.pose.shape[1]))
+        x, y, heading = np.swapaxes(slope[..., 1:], 0, 1)
+        if dof == 0:
+            x[:] = self.ahead[0] * chi
+            y[:] = self.ahead[1] * chi
+        elif dof == 1:
+            x[:] = -self.ahead[1] * chi
+            y[:] = self.ahead[0] * chi
+        else:
+            dx, dy = np.diff(self.pose[:2])
+            heading[:] = self.dt * chi
+            lean = np.cumsum(heading, axis=1) - heading / 2.0
+            shorter = -self.turn / 12.0 * heading
+            x[:] = shorter * dx - lean * dy
+            y[:] = shorter * dy + lean * dx
+        return np.cumsum(slope, axis=2, out=slope)
+
+
+def _mount_poses(mounting: Array, base: Array, slope: Array) -> tuple[Array, Array]:
     """Returns ends (W, H, 3) and their derivatives for a body at a pose (3,) in the base."""
-    end = geometry.between(mounting, geometry.compose(shot.end, mounting))
-    end[..., 2] = shot.end[..., 2]
+    end = geometry.between(mounting, geometry.compose(base, mounting))
+    end[..., 2] = base[..., 2]
     arm = np.broadcast_to(mounting[:2], (*end.shape[:2], 2))
-    arm = geometry.rotate(arm, shot.end[..., 2])
+    arm = geometry.rotate(arm, base[..., 2])
     across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)[..., None]
-    moved = shot.slope[..., :2, :] + across * shot.slope[..., 2:, :]
+    moved = slope[..., :2, :] + across * slope[..., 2:, :]
     c = np.cos(mounting[2])
     s = np.sin(mounting[2])
     along = moved[..., 0, :]
     aside = moved[..., 1, :]
-    rows = [c * along + s * aside, c * aside - s * along, shot.slope[..., 2, :]]
+    rows = [c * along + s * aside, c * aside - s * along, slope[..., 2, :]]
     return end, np.stack(rows, axis=-2)
 
 
 @dataclass(frozen=True)
 class Predictive:
-    """A model fitted to predictions."""
+    """A model fitted to predictions; its uncertainty is computed when it is asked for."""
 
     model: TaylorModel
     names: tuple[str, ...]  # of the parameters
     values: Array  # (I,) of the parameters
-    residual: Array  # (n,) scaled errors [m/s]
-    # (I, I) covariance of the values; NaN for known ones
-    value_covariance: Array
-    coefficient_errors: Array  # (D, K) standard errors; NaN for known coefficients
+    search: "_Search"
+    theta: Array  # the minimum, as the search scales it
+
+    @cached_property
+    def _uncertainty(self) -> tuple[Array, Array]:
+        return self.search.estimate_uncertainty(self.theta)
+
+    @property
+    def residual(self) -> Array:
+        """The scaled errors (n,) of the predictions [m/s]."""
+        return self.search.measure_errors(self.theta)
+
+    @property
+    def value_covariance(self) -> Array:
+        """The covariance (I, I) of the values; NaN for known ones."""
+        return self._uncertainty[0]
+
+    @property
+    def coefficient_errors(self) -> Array:
+        """The standard errors (D, K) of the coefficients; NaN for known ones."""
+        return self._uncertainty[1]
 
     @property
     def named(self) -> Values:
@@ -314,17 +442,25 @@ class _Search:
         self.unit = (spread[:, None] / np.maximum(size, 1e-9))[free]
         self.first, self.steps = problem.list_windows(inside)
         self.wanted = self.steps > 0
+        self.weight = self._weigh_errors()
+        self.measured = problem.measure_motion(self.first, self.steps)
+        self.sought = self.parameters.sought
+        self.count = len(self.sought)
+        self.pull = REFERENCE_M_S * np.sqrt(pull * 3 * np.count_nonzero(self.wanted))
+        self.known: tuple[Array, Array] | None = (
+            None  # the latest theta, and its errors
+        )
+
+    def _weigh_errors(self) -> Array:
+        """Returns the weights (W, H, 3) of errors at the ends of windows."""
+        problem = self.problem
         weight = np.array([1.0, 1.0, HEADING_ARM_M])
         usual = np.array(problem.horizons) + problem.noise_m / DRIFT_M_S
         t = problem.samples.t
         trust = problem.trust(
             t[self.first][:, None], t[self.first[:, None] + self.steps]
         )
-        self.weight = weight / usual[:, None] * np.sqrt(trust)
-        self.measured = problem.measure_motion(self.first, self.steps)
-        self.sought = self.parameters.sought
-        self.count = len(self.sought)
-        self.pull = REFERENCE_M_S * np.sqrt(pull * 3 * np.count_nonzero(self.wanted))
+        return np.asarray(weight / usual[:, None] * np.sqrt(trust))
 
     def at(self, theta: Array) -> tuple[TaylorModel, Array]:
         """Returns the model, before values shape it, and the values of the parameters."""
@@ -335,10 +471,9 @@ class _Search:
         values = np.maximum(values, self.parameters.low)  # rounding could pass it
         return replace(self.model, coefficients=coefficients), values
 
-    def shot(self, theta: Array, sloped: bool) -> tuple[Array, Array]:
-        """Returns scaled errors (n,), and derivatives (n, P) by the coefficients."""
+    def shoot(self, theta: Array, free: Mask | None = None) -> tuple[Array, Array]:
+        """Returns scaled errors (n,), and derivatives (n, P) by the `free` coefficients."""
         trial, values = self.at(theta)
-        free = self.free if sloped else None
         end, slope = self.problem.predict(trial, values, self.first, self.steps, free)
         error = end - self.measured
         error[..., 2] = geometry.wrap_angle(error[..., 2])
@@ -347,21 +482,28 @@ class _Search:
         rows = np.nan_to_num(rest[self.wanted].ravel(), nan=FARTHEST_M)
         return rows, slopes.reshape(len(rows), slope.shape[-1])
 
+    def measure_errors(self, theta: Array) -> Array:
+        """Returns the scaled errors (n,)."""
+        if self.known is None or not np.array_equal(theta, self.known[0]):
+            self.known = theta.copy(), self.shoot(theta)[0]
+        return self.known[1]
+
     def residual(self, theta: Array) -> Array:
         """Returns the residual (n + P,): errors, and pulls of the coefficients."""
-        return np.append(self.shot(theta, False)[0], self.pull * theta[self.count :])
+        pulls = self.pull * theta[self.count :]
+        return np.append(self.measure_errors(theta), pulls)
 
     def jacobian(self, theta: Array) -> Array:
         """Returns the derivatives (n + P, I + P) of the residual."""
-        count = self.count
-        unit = self.unit
-        rest, slope = self.shot(theta, True)
-        by_values = self.differentiate_by_values(theta, rest)
-        slope = np.clip(np.nan_to_num(slope * unit), -STEEPEST, STEEPEST)
-        own = np.concatenate(
-            [np.zeros((len(unit), count)), self.pull * np.eye(len(unit))], axis=1
-        )
-        return np.concatenate([np.concatenate([by_values, slope], axis=1), own])
+        pulls = np.zeros((len(self.unit), len(theta)))
+        pulls[:, self.count :] = self.pull * np.eye(len(self.unit))
+        return np.concatenate([self.differentiate(theta), pulls])
+
+    def differentiate(self, theta: Array) -> Array:
+        """Returns the derivatives (n, I + P) of the errors."""
+        rest, slope = self.shoot(theta, self.free)
+        slope = np.clip(np.nan_to_num(slope * self.unit), -STEEPEST, STEEPEST)
+        return np.concatenate([self.differentiate_by_values(theta, rest), slope], 1)
 
     def differentiate_by_values(self, theta: Array, rest: Array) -> Array:
         """Returns derivatives (n, I) of errors (n,) by the scaled values."""
@@ -373,58 +515,66 @@ class _Search:
                 step = self.model.dt / self.parameters.scale[value]
             trial = theta.copy()
             trial[i] += step
-            errors, _ = self.shot(trial, False)
-            slopes[:, i] = (errors - rest) / step
+            slopes[:, i] = (self.shoot(trial)[0] - rest) / step
         return slopes
 
     def run(self, first: Array | None, evaluations: int) -> Predictive:
         """Searches for the minimum of the errors."""
-        count = self.count
         start = np.zeros(self.count + len(self.unit))
         begun = self.residual(start)
         if first is not None:
             trial = start.copy()
-            trial[count:] = (
-                first[self.free] - self.model.coefficients[self.free]
-            ) / self.unit
+            shift = first[self.free] - self.model.coefficients[self.free]
+            trial[self.count :] = shift / self.unit
             rest = self.residual(trial)
             if np.abs(rest).sum() < np.abs(begun).sum():
                 start = trial
                 begun = rest
-        low = np.full(len(start), -np.inf)
-        high = -low
-        parameters = self.parameters
-        at = self.sought
-        low[:count] = ((parameters.low - parameters.start) / parameters.scale)[at]
-        high[:count] = ((parameters.high - parameters.start) / parameters.scale)[at]
+        low, high = self._list_bounds()
         # At a bound the search would not move.
-        aside = np.minimum(INSIDE * (high - low)[:count], 1.0)
-        start[:count] = np.clip(0.0, low[:count] + aside, high[:count] - aside)
+        aside = np.minimum(INSIDE * (high - low), 1.0)[: self.count]
+        start[: self.count] = np.clip(
+            0.0, low[: self.count] + aside, high[: self.count] - aside
+        )
         size = max(float(np.median(np.abs(begun))), LEAST_SCALE)
         best = minimise_robustly(
             self.residual, self.jacobian, start, (low, high), size, evaluations
         )
-        return self.predictive(best)
+        model, values = self.at(best)
+        model = self.problem.shape(model, self.parameters.name(values))
+        return Predictive(model, self.parameters.names, values, self, best)
 
-    def predictive(self, theta: Array) -> Predictive:
-        """Returns the model with the data for its uncertainty."""
-        best, values = self.at(theta)
-        best = self.problem.shape(best, self.parameters.name(values))
-        rest = self.shot(theta, False)[0]
-        starts = self.problem.samples.t[self.first]
-        starts = np.repeat(starts, 3 * self.wanted.sum(axis=1))
-        span = np.floor(starts / max(self.problem.horizons)).astype(np.intp)
-        prior = np.append(np.zeros(self.count), np.full(len(self.unit), self.pull))
-        slopes = self.jacobian(theta)[: len(rest)]
-        scale = np.append(self.parameters.scale[self.sought], self.unit)
+    def _list_bounds(self) -> tuple[Array, Array]:
+        """Returns the bounds (I + P,) of the scaled values; coefficients have none."""
+        unbounded = np.full(len(self.unit), np.inf)
+        parameters = self.parameters
+        low, high = (
+            ((bound - parameters.start) / parameters.scale)[self.sought]
+            for bound in (parameters.low, parameters.high)
+        )
+        return np.append(low, -unbounded), np.append(high, unbounded)
+
+    def estimate_uncertainty(self, theta: Array) -> tuple[Array, Array]:
+        """Returns the covariance (I, I) of the values, and errors (D, K) of the coefficients."""
+        count = self.count
+        rest = self.measure_errors(theta)
+        slopes = self.differentiate(theta)
+        span = self._cluster_rows()
+        prior = np.append(np.zeros(count), np.full(len(self.unit), self.pull))
+        scale = self.parameters.scale[self.sought]
         joint = estimate_clustered_covariance(slopes, rest, span, prior**2)
-        joint = joint * np.outer(scale, scale)
-        size = len(values)
-        covariance = np.full((size, size), np.nan)
-        covariance[np.ix_(self.sought, self.sought)] = joint[: self.count, : self.count]
+        known = len(self.parameters.names)
+        covariance = np.full((known, known), np.nan)
+        places = np.ix_(self.sought, self.sought)
+        covariance[places] = joint[:count, :count] * np.outer(scale, scale)
         errors = np.full(self.free.shape, np.nan)
         # Without the pull, which would make them seem more certain than the drive does.
-        alone = estimate_clustered_errors(slopes[:, self.count :], rest, span)
+        alone = estimate_clustered_errors(slopes[:, count:], rest, span)
         errors[self.free] = alone * self.unit
-        names = self.parameters.names
-        return Predictive(best, names, values, rest, covariance, errors)
+        return covariance, errors
+
+    def _cluster_rows(self) -> Rows:
+        """Returns the part of the drive (n,) in which each error's window starts."""
+        starts = self.problem.samples.t[self.first]
+        starts = np.repeat(starts, 3 * self.wanted.sum(axis=1))
+        return np.floor(starts / max(self.problem.horizons)).astype(np.intp)

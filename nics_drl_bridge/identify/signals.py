@@ -192,7 +192,20 @@ def resample(
     weights = weights[distinct]
     if half_width == 0.0:
         return np.asarray(scipy.interpolate.make_interp_spline(t, pose, k=3)(at))
-    # Rows first to last - 1 are the poses of each time; `row` (n, m) pads them to one number m.
+    row, is_used = _find_rows_around(t, at, half_width)
+    weight = is_used[..., None] * weights[row]  # (n, m, 3)
+    z = (t[row] - at[:, None]) / half_width
+    change = pose[row] - pose[row[:, :1]]
+    return np.asarray(_fit_parabolas(z, change, weight) + pose[row[:, 0]])
+
+
+def _find_rows_around(
+    t: Array, at: Array, half_width: float
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Returns rows (n, m) of stamps around each time (n,), and which of these to use.
+
+    Those not to be used pad the rows to one number m.
+    """
     first = np.minimum(np.searchsorted(t, at - half_width), np.searchsorted(t, at) - 2)
     first = np.clip(first, 0, max(len(t) - FEWEST_SMOOTHED, 0))
     last = np.maximum(np.searchsorted(t, at + half_width), first + FEWEST_SMOOTHED)
@@ -200,14 +213,15 @@ def resample(
     most = min(MOST_SMOOTHED, int((last - first).max()))
     row = first[:, None] + stride[:, None] * np.arange(most)
     is_used = (row < last[:, None]) & (row < len(t))
-    row = np.minimum(row, len(t) - 1)
-    weight = is_used[..., None] * weights[row]  # (n, m, 3)
-    # The normal equations of  pose - pose[first] = c0 + c1 z + c2 z^2,  z from -1 to 1, for each
-    # time n, neighbour k, degree of freedom d, powers i and j. The value at the time is c0.
-    z = (t[row] - at[:, None]) / half_width
+    return np.minimum(row, len(t) - 1), is_used
+
+
+def _fit_parabolas(z: Array, change: Array, weight: Array) -> Array:
+    """Returns the values (n, 3) at z = 0 of parabolas through changes (n, m, 3) at z (n, m)."""
+    # The normal equations of  change = c0 + c1 z + c2 z^2,  z from -1 to 1, for each time n,
+    # neighbour k, degree of freedom d, powers i and j. The value at the time is c0.
     basis = z[..., None] ** np.arange(3)
     normal = np.einsum("nki,nkd,nkj->ndij", basis, weight, basis) + RIDGE * np.eye(3)
-    change = pose[row] - pose[first][:, None]
     right = np.einsum("nki,nkd,nkd->ndi", basis, weight, change)
     coefficients = np.linalg.solve(normal, right[..., None])[..., 0]  # (n, 3, 3)
-    return np.asarray(coefficients[..., 0] + pose[first])
+    return np.asarray(coefficients[..., 0])

@@ -86,56 +86,83 @@ def minimise_robustly(
     ends there. The residual is computed at most `evaluations` times. Raises ValueError if the
     residual of the start is not finite.
     """
-    low, high = bounds
-    theta = start
-    rest = residual(theta)
-    loss = _sum_softly(rest, size)
-    if not np.isfinite(loss):
+    here = _Point(start, residual(start), size)
+    if not np.isfinite(here.loss):
         raise ValueError("the residual of the start is not finite.")
     least, most = DAMPING_RANGE
     damping = FIRST_DAMPING
     left = evaluations - 1
     while left > 0 and damping < most:
-        slopes = jacobian(theta)
-        # The loss of an error e has the slope weight * e, and the curvature weight^3.
-        weight = 1.0 / np.hypot(1.0, rest / size)
-        gradient = slopes.T @ (weight * rest)
-        normal = (slopes * weight[:, None] ** 3).T @ slopes
-        held = (theta <= low) & (gradient > 0.0)
-        held |= (theta >= high) & (gradient < 0.0)
-        free = np.flatnonzero(~held & (np.diag(normal) > 0.0))
-        if not gradient[free].any():
+        step = _DampedStep.at(here, jacobian(here.theta), bounds)
+        if not step.gradient[step.free].any():
             break
-        inner = normal[np.ix_(free, free)]
         harder = 2.0
         improved = 0.0
         gain = 1.0
         while left > 0 and damping < most and not improved:
-            damped = inner + damping * np.diag(np.diag(inner))
-            trial = theta.copy()
-            trial[free] -= np.linalg.solve(damped, gradient[free])
-            trial = np.clip(trial, low, high)
-            trial_rest = residual(trial)
+            theta = np.clip(here.theta + step.find(damping), *bounds)
+            trial = _Point(theta, residual(theta), size)
             left -= 1
-            trial_loss = _sum_softly(trial_rest, size)
-            if not trial_loss < loss:
+            if not trial.loss < here.loss:
                 damping *= harder
                 harder *= 2.0
                 continue
-            step = trial - theta
-            expected = -float(gradient @ step + step @ normal @ step / 2.0)
-            improved = (loss - trial_loss) / loss
-            gain = 0.0  # a bound may end a step where the quadratic model is worse
-            if expected > 0.0:
-                gain = min((loss - trial_loss) / expected, 1.0)
+            improved = (here.loss - trial.loss) / here.loss
+            gain = step.rate(here, trial)
             damping *= max(EASIER, 1.0 - (2.0 * gain - 1.0) ** 3)
             damping = max(damping, least)
-            theta = trial
-            rest = trial_rest
-            loss = trial_loss
+            here = trial
         if improved < ROBUST_TOLERANCE and gain > WELL_FORESEEN:
             break
-    return theta
+    return here.theta
+
+
+class _Point:
+    """Parameters (P,), their residual (n,), and its loss."""
+
+    def __init__(self, theta: Array, rest: Array, size: float) -> None:
+        self.theta = theta
+        self.rest = rest
+        # The loss of an error e has the slope weight * e, and the curvature weight^3.
+        self.weight = 1.0 / np.hypot(1.0, rest / size)
+        self.loss = _sum_softly(rest, size)
+
+
+@dataclass(frozen=True)
+class _DampedStep:
+    """Normal equations of a loss around a point, and the parameters that no bound holds."""
+
+    gradient: Array  # (P,)
+    normal: Array  # (P, P)
+    free: NDArray[np.intp]
+
+    @classmethod
+    def at(
+        cls, here: _Point, slopes: Array, bounds: tuple[Array, Array]
+    ) -> "_DampedStep":
+        """Returns the equations at a point with a Jacobian (n, P)."""
+        low, high = bounds
+        gradient = slopes.T @ (here.weight * here.rest)
+        normal = (slopes * here.weight[:, None] ** 3).T @ slopes
+        held = (here.theta <= low) & (gradient > 0.0)
+        held |= (here.theta >= high) & (gradient < 0.0)
+        free = np.flatnonzero(~held & (np.diag(normal) > 0.0))
+        return cls(gradient, normal, free)
+
+    def find(self, damping: float) -> Array:
+        """Returns the step (P,)."""
+        inner = self.normal[np.ix_(self.free, self.free)]
+        damped = inner + damping * np.diag(np.diag(inner))
+        step = np.zeros(len(self.gradient))
+        step[self.free] = -np.linalg.solve(damped, self.gradient[self.free])
+        return step
+
+    def rate(self, here: _Point, trial: _Point) -> float:
+        """Returns the share of the expected improvement that a trial made, up to 1."""
+        step = trial.theta - here.theta
+        expected = -float(self.gradient @ step + step @ self.normal @ step / 2.0)
+        # a bound may end a step where the quadratic model is worse
+        return min((here.loss - trial.loss) / expected, 1.0) if expected > 0.0 else 0.0
 
 
 def _sum_softly(residual: Array, size: float) -> float:

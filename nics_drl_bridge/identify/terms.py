@@ -32,7 +32,9 @@ from nics_drl_bridge.identify.fit import (
     TOGETHER,
     Alpha,
     Fit,
+    Regression,
     find_constant_combinations,
+    fit_kept_terms,
     list_unmoved_variables,
     prune_and_refit,
     regress,
@@ -92,12 +94,22 @@ class Library:
         """Fits the terms up to an order."""
         if self.kind is Kind.MOTION:
             return fit_motion_terms(samples, self.spec, order)
+        fit = prune_and_refit(self._regress(samples, order), self.spec, self.alpha)
+        return replace(fit, model=self._define(fit.model))
+
+    def fit_model(self, samples: Samples, order: int) -> TaylorModel:
+        """Fits the terms up to an order, without errors, which take most of the time."""
+        if self.kind is Kind.MOTION:
+            return fit_motion_model(samples, self.spec, order, select_motion_terms)
+        regression = self._regress(samples, order)
+        return self._define(fit_kept_terms(regression, self.spec, self.alpha))
+
+    def _regress(self, samples: Samples, order: int) -> Regression:
+        """Fits all terms up to an order that a state which is no motion may have."""
         allowed = None
         if self.kind is Kind.FOLLOWER:
             allowed = partial(select_terms_through_state, centred=self.centred)
-        regression = regress(samples, self.spec, order, True, allowed)
-        fit = prune_and_refit(regression, self.spec, self.alpha)
-        return replace(fit, model=self._define(fit.model))
+        return regress(samples, self.spec, order, True, allowed)
 
     def _define(self, model: TaylorModel) -> TaylorModel:
         """Drops lateral motion that is noise; an inferred speed is that along x."""
@@ -123,15 +135,15 @@ class Library:
     def fit_base(self, samples: Samples, tyres: bool) -> TaylorModel:
         """Fits the base: the textbook's terms of a motion, else those up to its order."""
         if self.kind is Kind.MEASURED:
-            return self.fit(samples, self.order).model
+            return self.fit_model(samples, self.order)
         if self.kind is Kind.FOLLOWER:
             through = partial(
                 select_terms_through_state, centred=self.centred, by_book=True
             )
             regression = regress(samples, self.spec, self.order, False, through)
-            return self._define(prune_and_refit(regression, self.spec, 1.0).model)
+            return self._define(fit_kept_terms(regression, self.spec, 1.0))
         allowed = partial(select_textbook_terms, tyres=tyres)
-        return fit_motion_terms(samples, self.spec, self.order, allowed).model
+        return fit_motion_model(samples, self.spec, self.order, allowed)
 
     def select_free(self, model: TaylorModel) -> Mask:
         """Selects the coefficients (D, K) that no definition and no measurement fixes."""
@@ -158,21 +170,45 @@ def fit_motion_terms(
         order: of the terms.
         allowed: a term filter; by default `select_motion_terms`.
     """
-    allowed = allowed or select_motion_terms
     constants = _find_constant_variables(samples, spec)
-    held = tuple(c.name for c in spec.command if constants.get(c.name))
-    fit = prune_and_refit(
-        regress(samples, spec, order, term_filter=partial(allowed, held=held)),
-        spec,
-        1.0,
+    regression = _regress_motion(
+        samples, spec, order, allowed or select_motion_terms, constants
     )
+    fit = prune_and_refit(regression, spec, 1.0)
+    return replace(fit, model=_define_motion(fit.model, samples, spec, constants))
+
+
+def fit_motion_model(
+    samples: Samples, spec: RobotSpec, order: int, allowed: Callable[..., Mask]
+) -> TaylorModel:
+    """Does the same as `fit_motion_terms`, without errors, which take most of the time."""
+    constants = _find_constant_variables(samples, spec)
+    regression = _regress_motion(samples, spec, order, allowed, constants)
+    model = fit_kept_terms(regression, spec, 1.0)
+    return _define_motion(model, samples, spec, constants)
+
+
+def _regress_motion(
+    samples: Samples,
+    spec: RobotSpec,
+    order: int,
+    allowed: Callable[..., Mask],
+    constants: dict[str, float],
+) -> Regression:
+    held = tuple(c.name for c in spec.command if constants.get(c.name))
+    return regress(samples, spec, order, term_filter=partial(allowed, held=held))
+
+
+def _define_motion(
+    model: TaylorModel, samples: Samples, spec: RobotSpec, constants: dict[str, float]
+) -> TaylorModel:
+    """Zeroes rates that never changed, and sets the rows of the twist that are states."""
     still = samples.dq.std(axis=0) <= NOTHING
     still[FIRST_STATE:] |= np.array(
         [v.name in constants for v in spec.state], dtype=np.bool_
     )
-    coefficients = np.where(still[:, None], 0.0, fit.model.coefficients)
-    model = replace(fit.model, coefficients=coefficients)
-    return replace(fit, model=_define_twist(model, spec, constants))
+    coefficients = np.where(still[:, None], 0.0, model.coefficients)
+    return _define_twist(replace(model, coefficients=coefficients), spec, constants)
 
 
 def _find_constant_variables(samples: Samples, spec: RobotSpec) -> dict[str, float]:

@@ -79,12 +79,9 @@ def make_textbook_model(
     targets = np.concatenate([relation.twist, rates], axis=1)
     allowed = _list_terms(relation, samples.x.shape[1], len(targets.T))
     pairs = zip(targets.T, allowed, strict=True)
-    terms = [_expand(samples.x, target, powers) for target, powers in pairs]
-    powers = np.unique(np.concatenate([rows for rows, _ in terms]), axis=0)
-    coefficients = np.zeros((len(terms), len(powers)))
-    for d, (rows, values) in enumerate(terms):
-        place = (powers == rows[:, None]).all(axis=2).argmax(axis=1)
-        coefficients[d, place] = values
+    powers, coefficients = _join_terms(
+        [_expand(samples.x, target, powers) for target, powers in pairs]
+    )
     limits = np.tile([-np.inf, np.inf], (len(spec.state), 1))
     limits[relation.is_speed] = _find_speed_limits(response)
     return TaylorModel(
@@ -122,6 +119,16 @@ def _expand(x: Array, target: Array, allowed: Powers) -> tuple[Powers, Array]:
     shown = np.abs(beta) > NEGLIGIBLE * max(float(np.linalg.norm(target)), 1e-12)
     beta = np.linalg.lstsq((chi / size)[:, shown], target, rcond=1e-9)[0]
     return allowed[shown], beta / size[shown]
+
+
+def _join_terms(expansions: list[tuple[Powers, Array]]) -> tuple[Powers, Array]:
+    """Returns the terms (K, V) of all degrees of freedom, and their coefficients (D, K)."""
+    powers = np.unique(np.concatenate([rows for rows, _ in expansions]), axis=0)
+    coefficients = np.zeros((len(expansions), len(powers)))
+    for d, (rows, values) in enumerate(expansions):
+        place = (powers == rows[:, None]).all(axis=2).argmax(axis=1)
+        coefficients[d, place] = values
+    return powers, coefficients
 
 
 class _Relation(NamedTuple):

@@ -261,6 +261,11 @@ def describe_responses(
                 lag += f" (+- {error:.4f} s)"
             taken = f"with a lag of {lag} and a gain of {response.gain:.4f}"
             yield f"{state} was not measured: it is taken to follow {command} {taken}."
+    yield from _describe_wheels(calibration)
+
+
+def _describe_wheels(calibration: Calibration) -> Iterator[str]:
+    """Yields sentences on the scale of the wheels, and on interchanged ones."""
     if calibration.wheel_scale is not None:
         scale = calibration.wheel_scale
         sigma = calibration.uncertainty["wheel_scale"]
@@ -333,15 +338,7 @@ def describe_unlearnt(
     """
     excitation = linear.regression.excitation
     yield from _describe_unmoved(linear, calibration, spec)
-    together = _join_names(excitation.together)
-    if together:
-        units = {c.unit for c in spec.command if c.name in excitation.together}
-        shares = "all have a share of it" if len(units) == 1 else "one has all of it"
-        why = "always moved together, so their effects can't be separated"
-        valid = "the model holds where they move together"
-        yield Gap(
-            f"{together} {why}: {shares}, and {valid}; drive each on its own to learn."
-        )
+    yield from _describe_together(excitation, spec)
     dependent = linear.regression.dependent
     copies = _join_names([v.name for v in spec.state if v.name in dependent])
     if copies:
@@ -360,6 +357,19 @@ def describe_unlearnt(
         finding = "between them the model is a straight line, whatever the robot does"
         yield Gap(
             f"{coarse} took only two values: {finding}; drive with values in between."
+        )
+
+
+def _describe_together(excitation: Excitation, spec: RobotSpec) -> Iterator[str]:
+    """Yields a sentence on commands that always moved together."""
+    together = _join_names(excitation.together)
+    if together:
+        units = {c.unit for c in spec.command if c.name in excitation.together}
+        shares = "all have a share of it" if len(units) == 1 else "one has all of it"
+        why = "always moved together, so their effects can't be separated"
+        valid = "the model holds where they move together"
+        yield Gap(
+            f"{together} {why}: {shares}, and {valid}; drive each on its own to learn."
         )
 
 

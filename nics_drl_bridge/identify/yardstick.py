@@ -200,11 +200,12 @@ class _Form:
 
     def unpack(self, theta: Array) -> TextbookResponse:
         """Returns the response for free values (P,)."""
-        masks = self.list_free()
-        parts = np.split(theta, np.cumsum([mask.sum() for mask in masks])[:-1])
         values = _flatten(self.start)
-        for value, mask, part in zip(values, masks, parts, strict=True):
-            value[mask] = part
+        begin = 0
+        for value, free in zip(values, self.list_free(), strict=True):
+            end = begin + int(free.sum())
+            value[free] = theta[begin:end]
+            begin = end
         delay, gain, offset, log_lag, log_limit, understeer, mounting = values
         limit = np.exp(np.clip(log_limit, *np.log(LIMIT_RANGE)))
         return TextbookResponse(
@@ -248,18 +249,33 @@ def probe_structure(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
     except ConfigError:
         return None
     forward = alone[speed, 0]
-    cosine = float(together[0] / forward)
-    front = cosine < 1.0 - 1e-6
-    if front:
-        angle = float(np.arccos(cosine))
-    else:  # the tangent of half an angle, from that of the angle
-        share = 1.0 - 2.0 * float(slower[2] / together[2])
-        angle = 2.0 * float(np.arctan(np.sqrt(max(share, 1e-6))))
-    length = abs(forward * (np.sin(angle) if front else np.tan(angle)) / together[2])
+    angle, bicycle = _find_bicycle(forward, together, slower)
     moves = np.zeros((3, 2))
     moves[0, speed] = forward / half[speed]
     moves[2, 1 - speed] = angle / half[1 - speed]
-    return moves, BicycleGeometry(True, front, float(length), 0.0)
+    return moves, bicycle
+
+
+def _find_bicycle(
+    forward: float, turning: Array, less: Array
+) -> tuple[float, BicycleGeometry]:
+    """Returns the steering angle of a bicycle that turns, and its geometry.
+
+    Args:
+        forward: its speed straight ahead [m/s].
+        turning: (3,) its twist at the same speed command and the angle.
+        less: (3,) likewise, at half the angle.
+    """
+    cosine = float(turning[0] / forward)
+    if cosine < 1.0 - 1e-6:
+        angle = float(np.arccos(cosine))
+        length = abs(forward * np.sin(angle) / turning[2])
+        return angle, BicycleGeometry(True, True, float(length), 0.0)
+    # the tangent of half an angle, from that of the angle
+    share = 1.0 - 2.0 * float(less[2] / turning[2])
+    angle = 2.0 * float(np.arctan(np.sqrt(max(share, 1e-6))))
+    length = abs(forward * np.tan(angle) / turning[2])
+    return angle, BicycleGeometry(True, False, float(length), 0.0)
 
 
 def _guess_response(
@@ -269,38 +285,53 @@ def _guess_response(
     structure = probe_structure(drive.spec)
     book, bicycle = structure or (np.ones((3, len(drive.spec.command))), STRAIGHT)
     seen = select_windows(drive, Calibration(), 0.0, until_s, GUESS_S, SPACING_S)
-    before = estimate_twists_at(drive, seen.start_t)
-    span = (seen.end_t - seen.start_t)[:, None]
-    twist = geometry.log(geometry.between(seen.start, seen.end)) / span
-    change = (estimate_twists_at(drive, seen.end_t) - before) / span
-    command = drive.recording.command
-    one_clock = command.clock == drive.recording.pose.clock
-    candidates = []
-    for delay in DELAYS_S if one_clock else FAR_DELAYS_S:
-        shift = clock_offset - delay
-        u = average_held(command, drive.spec, seen.start_t + shift, seen.end_t + shift)
+    motion = _MeanMotion.over(drive, seen)
+    guesses = []
+    for delay in _list_delays(drive):
+        start = seen.start_t + (clock_offset - delay)
+        end = seen.end_t + (clock_offset - delay)
+        u = average_held(drive.recording.command, drive.spec, start, end)
         rotation = 0.0
         if structure is not None:
-            rotation = _find_rotation(u @ book.T, twist)
-        left, gain, offset, lag = _regress_twists(
-            u,
-            _rotate_twists(twist, -rotation),
-            _rotate_twists(change, -rotation),
-            book != 0.0,
-            bicycle,
-            offsets,
-        )
+            rotation = _find_rotation(u @ book.T, motion.twist)
         place = np.array([0.0, 0.0, -rotation])
-        limit = np.full(2, LIMIT)
-        response = TextbookResponse(
-            float(delay), gain, offset, lag, limit, bicycle, place
-        )
-        candidates.append((left, response))
-    _, start = min(candidates, key=lambda pair: pair[0])
+        seen_so = motion.turn(-rotation)
+        guess = _regress_twists(u, seen_so, book != 0.0, bicycle, offsets)
+        guesses.append((*guess, delay, place))
+    _, gain, offset, lag, delay, place = min(guesses, key=lambda guess: guess[0])
+    limit = np.full(2, LIMIT)
+    response = TextbookResponse(delay, gain, offset, lag, limit, bicycle, place)
     # Unequal wheels look like a lateral lever arm; without a textbook, any gain may be one.
     mounted = np.array([True, np.count_nonzero(book[0]) < 2, True])
-    mounted &= structure is not None
-    return _Form(start, book != 0.0, mounted)
+    return _Form(response, book != 0.0, mounted & (structure is not None))
+
+
+def _list_delays(drive: Drive) -> list[float]:
+    """Returns the delays [s] at which gains and lags are guessed."""
+    recording = drive.recording
+    one_clock = recording.command.clock == recording.pose.clock
+    delays: list[float] = (DELAYS_S if one_clock else FAR_DELAYS_S).tolist()
+    return delays
+
+
+class _MeanMotion(NamedTuple):
+    """Mean motions over windows."""
+
+    twist: Array  # (W, 3)
+    change: Array  # (W, 3) rate of the twist
+
+    @classmethod
+    def over(cls, drive: Drive, seen: Windows) -> "_MeanMotion":
+        """Measures the motions of the tracked body over windows of a drive."""
+        span = (seen.end_t - seen.start_t)[:, None]
+        twist = geometry.log(geometry.between(seen.start, seen.end)) / span
+        before = estimate_twists_at(drive, seen.start_t)
+        after = estimate_twists_at(drive, seen.end_t)
+        return cls(twist, (after - before) / span)
+
+    def turn(self, angle: float) -> "_MeanMotion":
+        """Returns the motions as seen by a body that is turned by an angle."""
+        return _MeanMotion(*(_rotate_twists(part, angle) for part in self))
 
 
 def _find_rotation(expected: Array, twist: Array) -> float:
@@ -311,8 +342,7 @@ def _find_rotation(expected: Array, twist: Array) -> float:
 
 def _regress_twists(
     u: Array,
-    twist: Array,
-    change: Array,
+    motion: _MeanMotion,
     moves: NDArray[np.bool_],
     bicycle: BicycleGeometry,
     offsets: bool,
@@ -323,15 +353,15 @@ def _regress_twists(
     offset = np.zeros(3)
     lag = np.full(3, LAG_S)
     for i in np.flatnonzero(moves.any(axis=1)):
-        target = twist[:, i]
+        target = motion.twist[:, i]
         chi = np.column_stack([u[:, moves[i]], np.full(len(u), float(offsets))])
         if (
             bicycle.used and i == 2
         ):  # an angle: it turns the robot in proportion to its speed
-            chi = chi * twist[:, :1] / bicycle.wheelbase
+            chi = chi * motion.twist[:, :1] / bicycle.wheelbase
             beta = np.linalg.lstsq(chi, target, rcond=None)[0]
         else:
-            lagged = np.column_stack([chi, -change[:, i]])
+            lagged = np.column_stack([chi, -motion.change[:, i]])
             beta = np.linalg.lstsq(lagged, target, rcond=None)[0]
             if beta[-1] > LAG_RANGE_S[0]:
                 lag[i] = min(beta[-1], LAG_RANGE_S[1])

@@ -13,6 +13,7 @@ from nics_drl_bridge.identify.shooting import (
     Parameters,
     Shooting,
     fit_to_predictions,
+    predict_along_path,
 )
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
@@ -107,6 +108,22 @@ def test_windows_that_are_predicted_together_end_as_each_alone(car, problem):
         assert np.array_equal(alone[1], slope[one])
     assert len(np.unique(steps.max(axis=1))) > 2
     assert (slope[steps > 0] != 0.0).any(axis=(0, 1)).all()
+
+
+def test_one_path_gives_the_windows_of_states_that_are_known_all_along(car, problem):
+    first, steps = problem.list_windows()
+    later = first > DELAY / DT
+    first = first[later]
+    steps = steps[later]
+    free = np.zeros(car.coefficients.shape, dtype=np.bool_)
+    free[:3] = True
+    command = problem.commands({"latency": DELAY})
+    x = np.concatenate([problem.samples.q[:, 3:], command], axis=1)
+    end, slope = predict_along_path(car, x, first, steps, free)
+    ends, slopes = problem.predict(car, np.array([DELAY]), first, steps, free)
+    assert end == pytest.approx(ends, abs=1e-9)
+    assert slope == pytest.approx(slopes, abs=1e-9)
+    assert (np.abs(slopes).max(axis=(0, 1)).any(axis=0)).all()
 
 
 def test_a_value_between_equal_bounds_stays_and_has_no_error(car, problem):
