@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from bench import at_least, missed_bars
+from bench import Silence, at_least
 
 from measuring.environments import NotInstalledError, clean, python_with
 from nics_drl_bridge.defaults import EPISODE_STEPS
@@ -259,14 +259,9 @@ def measure(
     return found
 
 
-def judge(result: Mapping[str, Any]) -> list[str]:
-    """Returns the bars of the peers that were missed; those that can't be installed miss none."""
-    missed = list(result["failed"].values())
-    for name, one in result["peer_readings"].items():
-        missed += judge_robots(name, one)
-    return missed
-
-
-def judge_robots(who: str, drove: Mapping[str, float]) -> list[str]:
-    """Returns the bars that robots miss which stand still or see nothing."""
-    return missed_bars(drove, DRIVEN, f"{who}: ")
+def set_bars(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the bars of the peers; those that can't be installed have none."""
+    return {
+        "failed": dict.fromkeys(result["failed"], Silence()),
+        "peer_readings": dict.fromkeys(result["peer_readings"], DRIVEN),
+    }

@@ -122,13 +122,8 @@ def draw(success: Curves, file: Path, multiples: Sequence[float]) -> None:
     )
     for axes, each in zip(grid, names, strict=False):
         for (robot, own), marker in zip(success.items(), cycle(style.MARKERS)):
-            share = 100.0 * np.array(
-                own[each], np.float64
-            )  # None where it was not driven
-            driven = ~np.isnan(share)
-            axes.plot(
-                where[driven], share[driven], marker=marker, markersize=4, label=robot
-            )
+            share = 100.0 * np.array(own[each])
+            axes.plot(where, share, marker=marker, markersize=4, label=robot)
         axes.axvline(1.0, color=style.OTHER, linestyle="--", linewidth=1.0)
         told = " / ".join(dict.fromkeys(some[each] for some in amounts))
         axes.set_title(f"{each}\n{told}")
@@ -137,9 +132,5 @@ def draw(success: Curves, file: Path, multiples: Sequence[float]) -> None:
         axes.set_xticks(where)
     for axes in grid[::3]:
         axes.set_ylabel("success [%]")
-    shares = [
-        share for own in success.values() for some in own.values() for share in some
-    ]
-    least = 100.0 * np.nanmin(np.array(shares, np.float64))
-    grid[0].set_ylim(max(0.0, 5.0 * np.floor(least / 5.0) - 5.0), 102.0)
+    grid[0].set_ylim(top=102.0)
     write_bytes(file, style.render_png(figure, grid[0]))
