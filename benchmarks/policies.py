@@ -4,7 +4,6 @@ python benchmarks/policies.py training | baselines | barn
 python benchmarks/policies.py transfer | robustness
 """
 
-import json
 import sys
 import tempfile
 import time
@@ -544,7 +543,6 @@ ROBUST_BARS = {
     # To one perturbation at its declared range.
     "lost_points": {"*": {"*": at_most(5.0 + ROUNDING)}},
 }
-Curves = Mapping[str, Mapping[str, Sequence[float]]]
 
 
 @dataclass(frozen=True)
@@ -601,13 +599,8 @@ def measure_robustness(given: Given) -> Result:
     with one of them at parts and multiples of its declared range: with the greatest value that the
     randomisation of its training draws. The footprint is no part of that, and time constants need
     not be; they are declared in measuring/perturbations.py. Lidar, gate, shield and estimator are
-    those of a deployment, and know nothing of the perturbation; success is by the truth. `--of
-    RESULTS` only draws the picture of earlier runs.
+    those of a deployment, and know nothing of the perturbation; success is by the truth.
     """
-    if given.of:
-        runs = json.loads(given.of.read_text(encoding="utf-8"))["runs"]
-        perturbations.draw(collect_curves(runs), given.picture, MULTIPLES)
-        raise SystemExit(0)
     jobs = [
         Job(robot, world, given.episodes, tuple(given.only), given.control)
         for robot, world in product(given.robots, given.worlds)
@@ -625,8 +618,6 @@ def measure_robustness(given: Given) -> Result:
         robot: {each: (some / episodes).tolist() for each, some in own.items()}
         for robot, own in counts.items()
     }
-    if given.picture:
-        perturbations.draw(success, given.picture, MULTIPLES)
     return {
         "declared": {
             robot: perturbations.describe(perturbations.load_declared(robot))
@@ -641,17 +632,9 @@ def measure_robustness(given: Given) -> Result:
     }
 
 
-def collect_curves(runs: Mapping[str, Any]) -> dict[str, dict[str, list[float]]]:
-    """Returns the success of all robots in results: robot -> perturbation -> by multiple."""
-    return {
-        robot: {each: list(some.values()) for each, some in own.items()}
-        for name, run in sorted(runs.items())
-        if name.startswith("robustness_") and run["result"]
-        for robot, own in run["result"]["success"].items()
-    }
-
-
-def find_losses(success: Curves) -> dict[str, dict[str, float]]:
+def find_losses(
+    success: Mapping[str, Any],
+) -> dict[str, dict[str, float]]:
     """Returns points of success lost at the declared range: robot -> perturbation -> value."""
     at = 1 + MULTIPLES.index(DECLARED)
     return {
@@ -744,8 +727,6 @@ BENCHMARKS = {
             "robots": SHIPPED,
             "worlds": some_of(ROBUST_WORLDS),
             "only": some_of(PERTURBATIONS),
-            "picture": {"type": Path, "help": "draw the curves into this file"},
-            "of": {"type": Path, "help": "draw the picture of these results only"},
         },
         short="--episodes 2 --robots differential --worlds circles --only drift",
         unsettled=("",),

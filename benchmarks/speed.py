@@ -29,7 +29,7 @@ from bench import (
 )
 from measuring import peers
 from measuring.rates import interleaved, medians, slowed
-from measuring.scenes import BATCH, CIRCLE, errors
+from measuring.scenes import BATCH, CIRCLE, Batch, errors
 from numpy.typing import NDArray
 
 from nics_drl_bridge import style
@@ -471,7 +471,6 @@ def draw_curves(result: Result, file: Path) -> None:
 
 # Scans beside peers
 
-RENDERERS: tuple[Renderer, ...] = ("baked", "exact")
 SCANS_AT_EQUAL_WORK = {"ir_sim": 2500.0, "irsim_x": 15.0}
 SCANS_WRITTEN = at_least(0.02, "share of the rate at which ranges can be written")
 # Against our exact scan [m]; the circles of ir-sim are polygons.
@@ -487,24 +486,23 @@ SPREAD = LidarSpec.model_validate(
 )
 
 
-class Scans:
-    """A batch of scans, each in a scene of its own."""
+def place_scans(drawn: list[Scene], turned: float = 0.0) -> Batch:
+    """Returns a scan at the start of each scene, every lidar turned [rad]."""
+    starts = np.array([scene.starts[0] for scene in drawn])
+    poses = np.zeros((len(drawn), len(drawn[0].bodies), 3))
+    poses[..., :2] = [scene.bodies[:, :2] for scene in drawn]
+    circles = (CIRCLE,) * poses.shape[1]
+    return Batch(circles, poses, starts + np.array([0.0, 0.0, turned]))
 
-    def __init__(self, table: LidarTable, drawn: list[Scene]) -> None:
-        self.table = table
-        self.starts = np.array([scene.starts[0] for scene in drawn])
-        poses = np.zeros((len(drawn), drawn[0].bodies.shape[0], 3))
-        poses[..., :2] = [scene.bodies[:, :2] for scene in drawn]
-        placed = Scanner(SPREAD, table).place((CIRCLE,) * poses.shape[1], poses)
-        self.scene = (placed, peers.WORLD.all_walls())
-        self.out = np.empty((len(drawn), SPREAD.beams), np.float32)
 
-    def render(self, renderer: Renderer, turned: float = 0.0) -> Any:
-        """Renders the batch, every lidar turned [rad]; returns ranges (N, B) [m]."""
-        scanner = Scanner(SPREAD, self.table, renderer)
-        starts = self.starts + np.array([0.0, 0.0, turned])
-        scanner.scan(starts, *self.scene, out=self.out)
-        return self.out.copy()
+def prepare_scan(
+    batch: Batch, table: LidarTable, renderer: Renderer
+) -> Callable[[], Any]:
+    """Returns a call that renders a batch among the walls and returns its ranges (N, B) [m]."""
+    scanner = Scanner(SPREAD, table, renderer)
+    scene = (batch.bodies(scanner), peers.WORLD.all_walls())
+    out = np.empty((len(batch.lidar), SPREAD.beams), np.float32)
+    return partial(scanner.scan, batch.lidar, *scene, out=out)
 
 
 def measure_lidar_peers(given: Given) -> Result:
@@ -516,19 +514,21 @@ def measure_lidar_peers(given: Given) -> Result:
     """
     rivals = () if given.without_peers else tuple(peers.PEERS)
     table = bake(SPREAD, (CIRCLE,))
-    batch = Scans(table, peers.make_scenes(given.scans))
-    calls: dict[str, Callable[[], object]] = {
-        name: slowed(partial(batch.render, name), given.control) for name in RENDERERS
+    batch = place_scans(peers.make_scenes(given.scans))
+    calls = {
+        name: slowed(prepare_scan(batch, table, name), given.control)
+        for name in ("baked", "exact")
     }
-    calls["write"] = partial(batch.out.fill, 1.0)
+    written = np.empty((given.scans, SPREAD.beams), np.float32)
+    calls["write"] = partial(written.fill, 1.0)
     drawn = peers.make_scenes(given.scenes)
     found = peers.measure(calls, rivals, drawn, given.repeats)
     rate = {name: given.scans / seconds for name, seconds in found.seconds.items()}
     theirs = {name: 1.0 / one["scan_s"] for name, one in found.peers.items()}
-    few = Scans(table, drawn)
     turned = SPREAD.angle_increment if given.control == "shifted" else 0.0
-    exact = few.render("exact", turned=turned)
-    ranges = {"baked": few.render("baked"), **found.ranges}
+    exact = prepare_scan(place_scans(drawn, turned), table, "exact")()
+    baked = prepare_scan(place_scans(drawn), table, "baked")()
+    ranges = {"baked": baked, **found.ranges}
     return {
         "times_as_fast_at_equal_work": {
             name: rate["baked"] / one for name, one in theirs.items()
