@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from campaign import FOLDER, Bar, Bars, Given, Result, at_least, at_most, run_campaign
+from gate_faults import HIGH, LOW, ROBOT, TWIST
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from parts.lossy_link import Link, NoNamespacesError, open_link
@@ -37,10 +38,6 @@ from nics_drl_bridge.nodes.faulty_robot import PERIOD_S, Robot
 from nics_drl_bridge.nodes.processes import NodeProcess
 from nics_drl_bridge.nodes.spun_node import SpunNode
 
-ROBOT = "ackermann"
-TWIST = np.array([0.5, 0.0, 0.1])
-LOW = np.array([0.0, 0.0, -0.5])
-HIGH = np.array([1.0, 0.0, 0.5])
 LOSSES = (5, 20)
 # the gate's limit of 0.35 s, and what its tick (0.02 s) and the way to the robot may add
 OLDEST_S = 0.40

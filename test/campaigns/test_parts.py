@@ -152,18 +152,19 @@ def test_failures_are_told_by_place_and_end_the_most_frequent_first(module):
 
 def test_a_run_goes_on_where_the_file_ends(module, tmp_path):
     transfer = module("transfer")
+    open_book = module("parts.book").Book
     file = tmp_path / "rows.jsonl"
     asked = {"worlds": ["room"], "randomisation": "mild", "control": None}
     seed = transfer.FIRST_SEED
     first, second = (drove("fast", seed + k, "success") for k in (0, 1))
-    transfer.Book(file, asked).add([second])
+    open_book(file, asked).add([second])
     with file.open("a") as torn:
         torn.write('{"robot": "rov')
     given = Namespace(episodes=3, robots=["rover"], **asked)
-    book = transfer.Book(file, asked)
+    book = open_book(file, asked)
     (job,) = transfer.plan_jobs(given, ["fast"], book)
     assert job.seeds == [seed, seed + 2]
     book.add([first])
-    assert transfer.Book(file, asked).rows == [first, second]
+    assert open_book(file, asked).rows == [second, first]
     with pytest.raises(SystemExit, match="another run"):
-        transfer.Book(file, asked | {"control": "ice"})
+        open_book(file, asked | {"control": "ice"})

@@ -13,7 +13,6 @@ goes on from there by the same command, and ends with the same figures.
 
 from __future__ import annotations
 
-import json
 import signal
 from collections import defaultdict
 from collections.abc import Sequence
@@ -39,6 +38,7 @@ from campaign import (
 )
 from measuring.evaluations import Standing
 from measuring.perturbations import open_real_model
+from parts.book import Book, Row
 from scipy import stats
 
 from nics_drl_bridge.commands.episodes import Conditions, make_env
@@ -79,7 +79,6 @@ ICE = 0.02  # friction of tyres on ice
 FAST_SUCCESS = at_least(0.95, "success in the fast simulator")
 APART = Bar(-3.0, 3.0, "points of success apart from the fast simulator")
 COLLISIONS = at_most(0.01, "collisions")
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -152,39 +151,6 @@ def drive_job(job: Job) -> list[Row]:
     return rows
 
 
-class Book:
-    """The rows of a run, in a file if there is one, whose first line says what was asked for."""
-
-    def __init__(self, file: Path | None, asked: Row) -> None:
-        self.asked = asked
-        self._file = file
-        head = json.dumps(asked)
-        text = file.read_text() if file is not None and file.exists() else ""
-        # A run that was killed while it wrote leaves a part of a line.
-        whole = text[: text.rfind("\n") + 1]
-        first, *rows = (whole or text or head).splitlines()
-        if first != head:
-            raise SystemExit(f"{file}: is of another run, {first}; name another file.")
-        self._rows = [json.loads(row) for row in rows]
-        if whole != text or not text:
-            self._write("w", [asked, *self._rows])
-
-    @property
-    def rows(self) -> list[Row]:
-        """All rows, in the same order whatever was driven first."""
-        return sorted(self._rows, key=key_of)
-
-    def add(self, rows: Sequence[Row]) -> None:
-        """Keeps rows."""
-        self._rows += rows
-        self._write("a", rows)
-
-    def _write(self, mode: str, lines: Sequence[Row]) -> None:
-        if self._file is not None:
-            with self._file.open(mode) as file:
-                file.write("".join(json.dumps(line) + "\n" for line in lines))
-
-
 def key_of(row: Row) -> tuple[str, str, int]:
     """Returns what an episode is known by."""
     return row["robot"], row["engine"], row["seed"]
@@ -238,10 +204,11 @@ def measure(given: Given) -> Result:
         drive_jobs(plan_jobs(given, engines, book), book)
     except KeyboardInterrupt:
         raise SystemExit("interrupted; with --out, the same command goes on") from None
+    rows = sorted(book.rows, key=key_of)  # whichever was driven first
     return {
-        "clusters": find_clusters(book.rows),
+        "clusters": find_clusters(rows),
         "left_out": left_out,
-        "engines": compare_engines(book.rows, given.robots, engines),
+        "engines": compare_engines(rows, given.robots, engines),
     }
 
 
