@@ -1,6 +1,6 @@
 """Runs the benchmarks, each to its end, and makes the tables of README and docs of what they found.
 
-    python benchmarks/bench.py run [--long] [--only NAME ...] [--out FILE] [--list]
+    python benchmarks/bench.py run [--long] [--only NAME ...] [--out FILE]
     python benchmarks/bench.py tables [--check]
 
 A file holds the benchmarks of one question, each with a name, as `python benchmarks/paper.py
@@ -13,8 +13,10 @@ runs, `figures.py` makes the tables.
 
 import argparse
 import json
+import math
 import os
 import platform
+import re
 import signal
 import subprocess
 import sys
@@ -53,26 +55,41 @@ LIBRARIES = ("numpy", "numba", "scipy", "gymnasium", "torch", "onnxruntime", "mu
 
 @dataclass(frozen=True)
 class Bar:
-    """What a figure has to reach; NaN never does.
+    """What a figure has to reach; NaN and None never do.
 
     Attributes:
-        side: `at most` or `at least`.
-        value: of the bar.
+        least: of what meets it.
+        most: of what meets it.
         what: the figure in words, where its name does not say it.
     """
 
-    side: str
-    value: float
+    least: float = -math.inf
+    most: float = math.inf
     what: str = ""
 
-    def missed_by(self, name: str, figure: float) -> list[str]:
-        """A sentence if a figure misses it."""
-        if self.side == "at most":
-            met = figure <= self.value
-        else:
-            met = figure >= self.value
-        sentence = f"{self.what or name} {figure:g}: must be {self.side} {self.value:g}"
-        return [] if met else [sentence]
+    def find_missed(self, name: str, figure: float | None) -> list[str]:
+        """Returns a sentence if a figure misses it."""
+        figure = math.nan if figure is None else figure
+        if self.least <= figure <= self.most:
+            return []
+        ends = [("at least", self.least), ("at most", self.most)]
+        told = " and ".join(
+            f"{side} {end:g}" for side, end in ends if abs(end) < math.inf
+        )
+        return [f"{self.what or name} {figure:g}: must be {told}"]
+
+
+@dataclass(frozen=True)
+class Silence:
+    """Bar of what went wrong, which should not be there at all."""
+
+    def find_missed(self, name: str, sentence: str) -> list[str]:
+        """Returns the sentence."""
+        return [f"{name}: {sentence}"]
+
+
+Bars = Mapping[str, "Bar | Silence | Bars"]
+"""Bars by the names of figures, as deep as these; `*` stands for every name that there is."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +113,7 @@ class Benchmark:
 
     Attributes:
         measure: takes the arguments and returns the figures; its docstring says what is measured.
-        judge: bars by the names of figures, or what returns a sentence for each bar that is missed.
+        bars: of the figures, or what makes them from the figures.
         controls: by their names.
         options: further arguments by their names: the default value, that and a help, or settings
             of `argparse`.
@@ -106,7 +123,7 @@ class Benchmark:
     """
 
     measure: Callable[[Given], Result]
-    judge: Mapping[str, Bar] | Callable[[Result], list[str]]
+    bars: Bars | Callable[[Result], Bars]
     controls: Mapping[str, Control]
     options: Mapping[str, Any] = field(default_factory=dict)
     short: str | None = ""
@@ -120,9 +137,11 @@ class Benchmark:
             words = [*self.short.split(), *words]
         given = parser.parse_args(words)
         result = self.measure(given)
-        judge = self.judge
-        missed = judge(result) if callable(judge) else missed_bars(result, judge)
-        answer(result, missed, given.json)
+        bars = self.bars(result) if callable(self.bars) else self.bars
+        missed = find_missed(result, bars)
+        told = {**result, FAILURES: missed}
+        sys.stdout.write(format_json(told, None if given.json else 1) + "\n")
+        raise SystemExit(1 if missed else 0)
 
 
 def run_benchmark(benchmarks: Mapping[str, Benchmark]) -> NoReturn:
@@ -141,28 +160,34 @@ def some_of(choices: Sequence[str]) -> dict[str, Any]:
 
 
 def at_most(value: float, what: str = "") -> Bar:
-    return Bar("at most", value, what)
+    return Bar(most=value, what=what)
 
 
 def at_least(value: float, what: str = "") -> Bar:
-    return Bar("at least", value, what)
+    return Bar(least=value, what=what)
 
 
-def missed_bars(
-    figures: Mapping[str, Any], bars: Mapping[str, Bar], where: str = ""
-) -> list[str]:
-    """A sentence for each bar that a figure of its name misses.
+def find_missed(figures: Mapping[str, Any], bars: Bars, where: str = "") -> list[str]:
+    """Returns a sentence for each bar that a figure of its name misses.
 
     Args:
         figures: that were measured.
-        bars: by the names of figures, all of which have to be there.
+        bars: of figures that all have to be there; under `*`, of one at least.
         where: stands before each sentence.
     """
-    return [
-        f"{where}{line}"
-        for name, bar in bars.items()
-        for line in bar.missed_by(name, figures[name])
-    ]
+    missed = []
+    for name, bar in bars.items():
+        names = figures if name == "*" else [name]
+        if not names:
+            missed.append(f"{where}nothing was measured")
+        for each in names:
+            if isinstance(bar, Mapping):
+                missed += find_missed(figures[each], bar, f"{where}{each}: ")
+            else:
+                missed += [
+                    where + line for line in bar.find_missed(each, figures[each])
+                ]
+    return missed
 
 
 def make_parser(doc: str | None, about: Benchmark) -> argparse.ArgumentParser:
@@ -173,7 +198,7 @@ def make_parser(doc: str | None, about: Benchmark) -> argparse.ArgumentParser:
         epilog="controls, which must fail: "
         + "; ".join(f"{k}: {v}" for k, v in controls.items()),
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--json", action="store_true", help="print it on one line")
     parser.add_argument(
         "--control",
         nargs="?",
@@ -192,32 +217,6 @@ def make_parser(doc: str | None, about: Benchmark) -> argparse.ArgumentParser:
                 settings = {"action": "store_true", "help": told}
         parser.add_argument(f"--{name}", **settings)
     return parser
-
-
-def table_of(result: Mapping[str, Any], indent: str = "") -> str:
-    """Figures for people, a line for each."""
-    return "".join(
-        f"{indent}{key}\n{table_of(value, indent + '  ')}"
-        if isinstance(value, Mapping)
-        else f"{indent}{key:<34}{value}\n"
-        for key, value in result.items()
-    )
-
-
-def answer(result: Mapping[str, Any], missed: Sequence[str], as_json: bool) -> NoReturn:
-    """Prints a result and the missed bars, and ends with 1 if there are any, else 0.
-
-    Args:
-        result: what was measured, as JSON can hold it; what is not finite becomes null.
-        missed: a sentence for each bar that was missed, with the figure and the bar.
-        as_json: whether to print one JSON object, with the sentences as `failures`.
-    """
-    if as_json:
-        sys.stdout.write(format_json({**result, FAILURES: list(missed)}) + "\n")
-    else:
-        sys.stdout.write(table_of(result))
-        sys.stdout.write("".join(f"FAILED: {line}\n" for line in missed))
-    raise SystemExit(1 if missed else 0)
 
 
 # The runs. `make benchmark` takes half an hour on two cores; LONG=1 takes hours and gives the
@@ -274,8 +273,8 @@ def read_runs() -> dict[str, Run]:
     }
 
 
-def make_sector_plan(folder: Path) -> dict[str, Run]:
-    """Every run of the scripts in a folder, by name; a script without a row is run as it is."""
+def list_runs(folder: Path) -> dict[str, Run]:
+    """Returns the runs of all scripts in a folder by name; a script without a row runs as it is."""
     runs = read_runs()
     known = {"bench.py", "figures.py", *(run.script for run in runs.values())}
     others = (path for path in sorted(folder.glob("*.py")) if path.name not in known)
@@ -311,21 +310,15 @@ def read_field(file: str, key: str) -> str:
 
 def describe_commit(folder: Path) -> dict[str, Any]:
     """The commit of a working tree, and whether more than results and text changed since."""
-    git = ["git", "-C", str(folder)]
+    order = "git status --porcelain=2 --branch --untracked-files=no -- ."
     left_out = (":(exclude)benchmarks/results.json", ":(exclude)*.md")
-    try:
-        commit = subprocess.run(
-            [*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True
-        )
-        changes = subprocess.run(
-            [*git, "status", "--porcelain", "-uno", "--", ".", *left_out],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
+    words = [*order.split(), *left_out]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    commit = re.search(r"^# branch.oid (\w{12})", done.stdout, re.MULTILINE)
+    changed = re.search(r"^[^#]", done.stdout, re.MULTILINE)
+    if commit is None:
         return {"commit": None, "dirty": None}
-    return {"commit": commit.stdout.strip()[:12], "dirty": bool(changes.stdout)}
+    return {"commit": commit[1], "dirty": changed is not None}
 
 
 def find_processes(mark: str) -> list[int]:
@@ -510,7 +503,6 @@ def main() -> None:
     run = commands.add_parser("run", help="run benchmarks")
     run.add_argument("--only", nargs="*", metavar="NAME", help="these; others are kept")
     run.add_argument("--long", action="store_true", help="hours instead of minutes")
-    run.add_argument("--list", action="store_true", help="print the names of the runs")
     run.add_argument("--out", type=Path, default=RESULTS, help="file of the results")
     run.add_argument("--timeout", type=float, help="seconds for each")
     run.add_argument(
@@ -522,13 +514,10 @@ def main() -> None:
     given = parser.parse_args()
     if given.command == "tables":
         raise SystemExit(write_tables(given.check))
-    plan = make_sector_plan(given.scripts)
+    plan = list_runs(given.scripts)
     unknown = [name for name in given.only or () if name not in plan]
     if unknown:
         parser.error(f"{unknown[0]!r} is no benchmark; there are {', '.join(plan)}.")
-    if given.list:
-        sys.stdout.write("".join(f"{name}\n" for name in plan))
-        return
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         code = run_all(given, plan)

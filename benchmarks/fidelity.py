@@ -6,21 +6,23 @@ python benchmarks/fidelity.py real_drives | generate_from_mujoco | estimator
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from bench import (
+    Bar,
+    Bars,
     Benchmark,
     Control,
     Given,
     Result,
     at_least,
     at_most,
-    missed_bars,
     run_benchmark,
     some_of,
 )
@@ -29,11 +31,11 @@ from measuring.drives import (
     RECORDINGS,
     SEGMENT_S,
     SEGMENTED,
-    judge_drives,
+    set_drive_bars,
 )
 from measuring.foreign_robots import ROBOTS, foreign_drive
 from measuring.league import Lesson, average_errors, hold_league, rank_ours
-from measuring.rates import interleaved, make_batched, make_single, shortest
+from measuring.rates import measure_speeds
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError
@@ -56,13 +58,13 @@ from nics_drl_bridge.recording.readers import open_drive
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
-from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
 
 # Real drives
 
 SEED = 11  # of the drives of the own robots
+AT_ONCE = 2
 
 
 def judge_model(found: Identified, control: str | None, league: bool = False) -> Result:
@@ -159,6 +161,7 @@ def measure_real_drives(given: Given) -> Result:
     the poses of the last third 5 s ahead by the commands, from every tenth of a second. Beside it,
     on the same windows: a robot that keeps its twist, and its textbook fitted to the same two
     thirds. With `--league` also what others fit to these, and the robot's description as it is.
+    Two drives are measured at a time.
     """
     control = given.control
     result: Result = {"drives": {}, "left_out": {}, "own_robots": {}}
@@ -166,19 +169,28 @@ def measure_real_drives(given: Given) -> Result:
     if real and not given.recordings.is_dir():
         place = given.recordings
         raise SystemExit(f"{place}: no such folder of recordings; give --recordings.")
-    for name in real:
-        drive = DRIVES[name]
-        source = given.recordings / drive.source
-        found = measure_drive(source, drive.mapping, control, given.league)
-        result["drives"][name] = found
-        if name == SEGMENTED:
-            result["left_out"][name] = leave_out(source, drive.mapping, control)
-    with tempfile.TemporaryDirectory() as folder:
+    spawn = get_context("spawn")
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        ProcessPoolExecutor(AT_ONCE, mp_context=spawn) as pool,
+    ):
+        jobs = {}
+        for name in real:
+            about = (
+                given.recordings / DRIVES[name].source,
+                DRIVES[name].mapping,
+                control,
+            )
+            jobs["drives", name] = pool.submit(measure_drive, *about, given.league)
+            if name == SEGMENTED:
+                jobs["left_out", name] = pool.submit(leave_out, *about)
         for name in (each for each in given.only if each in ROBOTS):
             source = Path(folder) / name
             mapping = foreign_drive(ROBOTS[name], SEED).write(source)
-            found = measure_drive(source, mapping, control)
-            result["own_robots"][name] = found
+            job = pool.submit(measure_drive, source, mapping, control)
+            jobs["own_robots", name] = job
+        for (kind, name), job in jobs.items():
+            result[kind][name] = job.result()
     result["league"] = rank_ours(result["drives"])
     return result
 
@@ -194,10 +206,6 @@ MUJOCO_BARS = {
 }
 FIRST_SEED = 201
 HOLDS_S = (0.5, 1.0, 0.3, 2.0)  # how long the unseen drives hold a command, in turn
-BATCH = 1024
-HOLDS = 20
-ROUNDS = 3
-STEPS = 50_000
 PHYSICS_S = 4.0
 
 
@@ -219,31 +227,6 @@ def average_drives(
         "worst_drive_error_over_path": max(shares),
         "mean_path_m": path,
     }
-
-
-def time_all(
-    model: TaylorModel, spec: RobotSpec, physics: Callable[[Array], None]
-) -> dict[str, float]:
-    """Returns simulated seconds per second: of many robots, of one, and of MuJoCo, in turn."""
-    rng = np.random.default_rng(7)
-    low = spec.command_low
-    high = spec.command_high
-    many = rng.uniform(low[:, None], high[:, None], (HOLDS, len(low), BATCH))
-    held = np.repeat(rng.uniform(low, high, (1, STEPS // 10, len(low))), 10, axis=1)
-    batched, ends = make_batched(model, many, round(0.1 / model.dt))
-    single, poses = make_single(model, held)
-    slow = rng.uniform(low, high, (round(10 * PHYSICS_S), len(low)))
-    calls: dict[str, Callable[[], object]] = {
-        "batched": batched,
-        "single": single,
-        "mujoco": partial(physics, slow),
-    }
-    seconds = shortest(interleaved(calls, ROUNDS))
-    lasted = {"batched": BATCH * HOLDS * 0.1, "single": STEPS * model.dt}
-    lasted["mujoco"] = PHYSICS_S
-    if not (np.isfinite(ends).all() and np.isfinite(poses).all()):
-        lasted |= dict.fromkeys(("batched", "single"), np.nan)  # fast and worthless
-    return {name: lasted[name] / each for name, each in seconds.items()}
 
 
 def measure_mujoco(given: Given) -> Result:
@@ -273,12 +256,17 @@ def measure_mujoco(given: Given) -> Result:
         model = replace(found.model, coefficients=factor * found.model.coefficients)
         found = replace(found, model=model)
 
-        def step(commands: Array, robot: MujocoRobot = robot) -> None:
+        size = (round(10 * PHYSICS_S), len(spec.command))
+        commands = np.random.default_rng(7).uniform(
+            spec.command_low, spec.command_high, size
+        )
+
+        def simulate(robot: MujocoRobot = robot, commands: Array = commands) -> None:
             for command in commands:
                 robot.step(command, 0.1)
 
         robot.reset(np.zeros(3))
-        speed = time_all(model, spec, step)
+        speed = measure_speeds(model, spec, {"mujoco": (simulate, PHYSICS_S)})
         if given.control == "slow":
             speed |= dict.fromkeys(("batched", "single"), speed["mujoco"])
         robots[name] = {
@@ -287,14 +275,6 @@ def measure_mujoco(given: Given) -> Result:
             "speed_up_single": speed["single"] / speed["mujoco"],
         }
     return {"robots": robots}
-
-
-def judge_mujoco(result: Result) -> list[str]:
-    return [
-        line
-        for name, robot in result["robots"].items()
-        for line in missed_bars(robot, MUJOCO_BARS, f"{name}: ")
-    ]
 
 
 # The estimator
@@ -311,12 +291,12 @@ OF_EACH = 0.35
 LEAST_PATH_M = 3.0  # a robot that drives less shows nothing
 POSE_STD = np.array([0.02, 0.02, 0.02])  # of motion capture [m, m, rad]
 STATE_DRIFT = 0.02  # part of its range by which the state drifts within a second
-NOISE = Noise(
-    odom_linear=Level(std=0.05, unit="m/s", source="measured"),
-    odom_angular=Level(std=0.05, unit="rad/s", source="measured"),
-    position_drift=Level(std=0.03, unit="m/sqrt(s)", source="measured"),
-    heading_drift=Level(std=0.03, unit="rad/sqrt(s)", source="measured"),
-)
+LEVELS = {
+    "odom_linear": (0.05, "m/s"),
+    "odom_angular": (0.05, "rad/s"),
+    "position_drift": (0.03, "m/sqrt(s)"),
+    "heading_drift": (0.03, "rad/sqrt(s)"),
+}
 WIDE = World.model_validate(
     {
         "name": "wide",
@@ -355,12 +335,16 @@ class _NoFilter(Middleware):
 
 def _expect_little(model: SimulatorModel) -> Middleware:
     """Returns a filter that expects a quarter of the noise."""
-    levels = {
-        name: level.model_copy(update={"std": level.std / 4.0})
-        for name in type(NOISE).model_fields
-        if isinstance(level := getattr(model.noise, name), Level)
+    few = make_levels({name: (std / 4.0, unit) for name, (std, unit) in LEVELS.items()})
+    return Middleware(replace(model, noise=model.noise.model_copy(update=few)))
+
+
+def make_levels(levels: Mapping[str, tuple[float, str]]) -> dict[str, Level]:
+    """Returns measured levels of noise from their standard deviations and units."""
+    return {
+        name: Level(std=std, unit=unit, source="measured")
+        for name, (std, unit) in levels.items()
     }
-    return Middleware(replace(model, noise=model.noise.model_copy(update=levels)))
 
 
 MAKES: dict[str | None, Callable[[SimulatorModel], Middleware]] = {
@@ -373,14 +357,11 @@ def make_noisy(robot: str) -> SimulatorModel:
     """Returns a shipped robot with the noise of this benchmark."""
     model = builtin_model(robot)
     states = {
-        v.name: Level(
-            std=STATE_DRIFT * (v.max - v.min),
-            unit=f"{v.unit}/sqrt(s)",
-            source="measured",
-        )
+        v.name: (STATE_DRIFT * (v.max - v.min), f"{v.unit}/sqrt(s)")
         for v in model.robot.state
     }
-    return replace(model, noise=NOISE.model_copy(update={"state_drift": states}))
+    noise = Noise(**make_levels(LEVELS), state_drift=make_levels(states))
+    return replace(model, noise=noise)
 
 
 def estimate_drive(
@@ -462,22 +443,20 @@ def measure_estimator(given: Given) -> Result:
     }
 
 
-def judge_estimator(result: Result) -> list[str]:
+def set_estimator_bars(result: Result) -> Bars:
     off = "the estimate is off, in parts of what odometry is, by"
-    low, high = result["nees_95_band"]
-    band = {"nees_mean": at_least(low, "NEES")}
-    missed = missed_bars(result, {"ekf_by_raw": at_most(OF_ALL, off), **band})
-    missed += missed_bars(result, {"nees_mean": at_most(high, "NEES")})
     each = {"ekf_by_raw": at_most(OF_EACH, off), "way_m": at_least(LEAST_PATH_M)}
-    for robot, figures in result["robots"].items():
-        missed += missed_bars(figures, each, f"{robot}: ")
-    return missed
+    return {
+        "ekf_by_raw": at_most(OF_ALL, off),
+        "nees_mean": Bar(*result["nees_95_band"], "NEES"),
+        "robots": {"*": each},
+    }
 
 
 BENCHMARKS = {
     "real_drives": Benchmark(
         measure_real_drives,
-        judge_drives,
+        set_drive_bars,
         {
             "standing": Control("the model: it says the robot stands", "error_m"),
             "ordered": Control(
@@ -495,7 +474,7 @@ BENCHMARKS = {
     ),
     "generate_from_mujoco": Benchmark(
         measure_mujoco,
-        judge_mujoco,
+        {"robots": {"*": MUJOCO_BARS}},
         {
             "standing": Control("the model: it says the robot stands", "over_path"),
             "slow": Control("the model's speed: it is MuJoCo's", "MuJoCo's speed"),
@@ -513,7 +492,7 @@ BENCHMARKS = {
     ),
     "estimator": Benchmark(
         measure_estimator,
-        judge_estimator,
+        set_estimator_bars,
         {
             "no_filter": Control("the filter: raw odometry stands in", "is off"),
             "overconfident": Control("three quarters of the noise expected", "NEES"),

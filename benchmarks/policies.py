@@ -4,7 +4,6 @@ python benchmarks/policies.py training | baselines | barn
 python benchmarks/policies.py transfer | robustness
 """
 
-import json
 import sys
 import tempfile
 import time
@@ -21,18 +20,19 @@ from typing import Any
 import gymnasium
 import numpy as np
 from bench import (
+    Bar,
+    Bars,
     Benchmark,
     Control,
     Given,
     Result,
     at_least,
     at_most,
-    missed_bars,
     run_benchmark,
     some_of,
 )
 from measuring import perturbations
-from measuring.evaluations import Standing, evaluate_all
+from measuring.evaluations import evaluate_all, open_driver
 from measuring.perturbations import PERTURBATIONS
 from numpy.typing import NDArray
 
@@ -65,8 +65,7 @@ from nics_drl_bridge.policy.evaluation import (
     successes,
     summarise,
 )
-from nics_drl_bridge.policy.file.stateful import Policy
-from nics_drl_bridge.policy.policies import POLICIES, list_shipped_policies, open_policy
+from nics_drl_bridge.policy.policies import POLICIES, list_shipped_policies
 from nics_drl_bridge.policy.train.settings import (
     TrainingSettings,
     load_training,
@@ -152,9 +151,8 @@ def measure_training(given: Given) -> Result:
     return {**worst, **longest, "steps_per_s": slowest, "robot": given.robot}
 
 
-def judge_training(result: Result) -> list[str]:
-    longest = {"wall_s": at_most(LONGEST_S[result["robot"]])}
-    return missed_bars(result, LEARNING_BARS | longest, f"{result['robot']}: ")
+def set_training_bars(result: Result) -> Bars:
+    return LEARNING_BARS | {"wall_s": at_most(LONGEST_S[result["robot"]])}
 
 
 # Planners and shipped policies
@@ -170,9 +168,7 @@ def drive_episodes(
 ) -> Summary:
     """Drives by a policy of that name, in a world."""
     model = open_model(robot)
-    policy, task = open_policy(name, model)
-    if control == "standing":
-        policy = Standing(task)
+    policy, task = open_driver(name, model, control)
     env = BridgeVectorEnv(episodes, model, world, task)
     seeds = range(FIRST_SEED, FIRST_SEED + episodes)
     return summarise(drive_worlds(env, policy.act, seeds), model.control_period)
@@ -193,17 +189,15 @@ def measure_baselines(given: Given) -> Result:
     return figures
 
 
-def judge_baselines(result: Result) -> list[str]:
-    missed = []
-    for place, told in result.items():
+def set_baseline_bars(result: Result) -> Bars:
+    bars = {}
+    for place in result:
         world, _, name = place.split("/")
-        values = {key: told[key]["value"] for key in ("success", "length")}
         floor = FLOORS.get(name, 0.0) if world == LEARNING_WORLD else 0.0
-        bars = {"success": at_least(floor)}
+        bars[place] = {"success": {"value": at_least(floor)}}
         if name in DRIVING:
-            bars["length"] = at_least(LEAST_PATH_M, "successful path [m]")
-        missed += missed_bars(values, bars, f"{place}: ")
-    return missed if result else ["no policy was driven"]
+            bars[place]["length"] = {"value": at_least(LEAST_PATH_M, "path [m]")}
+    return bars
 
 
 # BARN
@@ -308,11 +302,8 @@ def drive_fast(
 ) -> BarnRuns:
     """Drives in the fast simulator, all worlds side by side."""
     model = open_model(BARN_ROBOT)
-    policy: Policy
-    policy, task = open_policy(name, model)
+    policy, task = open_driver(name, model, control)
     task = replace(task, **OPTIONS)
-    if control == "standing":
-        policy = Standing(task)
     world = WorldSet("courses", tuple(course.world for course in courses.values()))
     seeds = find_seeds(world, runs)
     steps = round(TIME_OUT_S / model.control_period)
@@ -427,11 +418,11 @@ def measure_barn(given: Given) -> Result:
     return {**first, **about, "policies": figures}
 
 
-def judge_barn(result: Result) -> list[str]:
+def set_barn_bars(result: Result) -> Bars:
     bars = dict(BARN_BARS[result["place"]])
     if result["training_s"] is not None:
         bars["training_s"] = TRAINING_S
-    return missed_bars(result, bars, f"{result['policy']}: ")
+    return bars
 
 
 # Transfer
@@ -441,15 +432,14 @@ TRANSFER_FLOORS = {
     **dict.fromkeys(("clutter", "corridor", "crowd", "room"), 0.95),
 }
 """Least success in process, by world: what fails everywhere alike has not been transferred."""
-MOST_BELIEVED = 0.05  # part of the episodes that may be successes to the robot alone
-APART_POINTS = {
-    DDS: 2.0,
-    MUJOCO: 4.0,
-    DART: 4.0,
-}  # how far the success may be from that in process
+ROUNDING = 1e-9
+BELIEVED = at_most(0.05 + ROUNDING, "successes to the robot alone")
+APART = {
+    place: Bar(-points - ROUNDING, points + ROUNDING, f"{LABELS[place]}: points off")
+    for place, points in ((DDS, 2.0), (MUJOCO, 4.0), (DART, 4.0))
+}
 TRANSFER_LIDAR = "rplidar_a2"
 TRANSFER_SEED = 2_000_000
-ROUNDING = 1e-9
 Found = dict[str, dict[str, dict[str, Any]]]
 
 
@@ -457,17 +447,6 @@ def get_conditions(robot: str) -> str:
     """Returns those of a deployment: a real lidar, mild randomisation, the robot's limits."""
     lidar = "" if load_robot(robot).lidar else f"--lidar {TRANSFER_LIDAR} "
     return f"{lidar}--randomisation mild --gate {robot}"
-
-
-def get_shares(found: Found, name: str) -> dict[str, Any]:
-    """Returns one share of the episodes, robot -> world -> place -> its value."""
-    return {
-        robot: {
-            world: {place: each[name][0] for place, each in places.items()}
-            for world, places in worlds.items()
-        }
-        for robot, worlds in found.items()
-    }
 
 
 def measure_transfer(given: Given) -> Result:
@@ -502,56 +481,51 @@ def measure_transfer(given: Given) -> Result:
     for name, figures in evaluated.items():
         robot, world = name.split("/")
         found[robot][world] = figures
-    keys = ("success", "collision", "believed", "length")
-    result: Result = {name: get_shares(found, name) for name in keys}
-    result["points_from_fast"] = {
-        robot: {world: find_points(places) for world, places in worlds.items()}
-        for robot, worlds in result["success"].items()
-    }
+    return tabulate_transfer(found)
+
+
+def tabulate_transfer(found: Found) -> Result:
+    """Returns figure -> robot -> world -> place -> its value."""
+    result: Result = defaultdict(lambda: defaultdict(dict))
+    for robot, worlds in found.items():
+        for world, places in worlds.items():
+            values = {
+                name: {place: each[name][0] for place, each in places.items()}
+                for name in ("success", "collision", "believed", "length")
+            }
+            success = values["success"]
+            values["alone"] = {
+                place: each - success[place]
+                for place, each in values["believed"].items()
+            }
+            values["points_from_fast"] = {
+                place: round(100.0 * (each - success[FAST]), 3)
+                for place, each in success.items()
+                if place != FAST and FAST in success
+            }
+            for name, each in values.items():
+                result[name][robot][world] = each
     return result
 
 
-def find_points(places: Mapping[str, float]) -> dict[str, float]:
-    """Returns the success in each place less that in process [points]."""
-    return {
-        place: round(100.0 * (each - places[FAST]), 3)
-        for place, each in places.items()
-        if place != FAST and FAST in places
+def set_transfer_bars(result: Result) -> Bars:
+    bars: dict[str, Any] = {
+        "alone": {"*": {"*": {"*": BELIEVED}}},
+        "length": {"*": {"*": {"*": at_least(LEAST_PATH_M, "path [m]")}}},
+        "success": {},
+        "points_from_fast": {},
     }
-
-
-def judge_transfer(result: Result) -> list[str]:
-    missed = []
-    for robot, worlds in result["success"].items():
-        for world, places in worlds.items():
-            who = f"{robot} in {world}"
-            floor = at_least(TRANSFER_FLOORS[world] - ROUNDING, "success in process")
-            missed += missed_bars(places, {FAST: floor} if FAST in places else {}, who)
-            points = {
-                place: abs(each)
-                for place, each in result["points_from_fast"][robot][world].items()
-            }
-            bars = {
-                place: at_most(
-                    APART_POINTS[place] + ROUNDING, f" {LABELS[place]}: points off"
-                )
-                for place in points
-            }
-            missed += missed_bars(points, bars, who)
-            for place, success in places.items():
-                length = result["length"][robot][world][place]
-                figures = {
-                    "alone": result["believed"][robot][world][place] - success,
-                    "length": np.nan if length is None else length,
-                }
-                bars = {
-                    "alone": at_most(
-                        MOST_BELIEVED + ROUNDING, "successes to the robot alone"
-                    ),
-                    "length": at_least(LEAST_PATH_M, "successful path [m]"),
-                }
-                missed += missed_bars(figures, bars, f"{who} {LABELS[place]}: ")
-    return missed if any(result["success"].values()) else ["no robot was driven"]
+    for robot, worlds in result["points_from_fast"].items():
+        bars["points_from_fast"][robot] = {
+            world: {place: APART[place] for place in places}
+            for world, places in worlds.items()
+        }
+        bars["success"][robot] = {
+            world: {FAST: at_least(TRANSFER_FLOORS[world] - ROUNDING)}
+            for world, places in result["success"][robot].items()
+            if FAST in places
+        }
+    return bars
 
 
 # Robustness
@@ -562,9 +536,11 @@ ROBUST_WORLDS = ("circles", "doorway", "clutter", "corridor", "crowd", "room")
 ROBUST_SEED = 3_000_000
 AT_ONCE = 2
 TENFOLD = 10.0
-LEAST_UNPERTURBED = at_least(0.95 - ROUNDING, "success without a perturbation")
-MOST_LOST = 5.0  # points lost to one perturbation at its declared range
-Curves = Mapping[str, Mapping[str, Sequence[float]]]
+ROBUST_BARS = {
+    "unperturbed": {"*": at_least(0.95 - ROUNDING, "success without a perturbation")},
+    # To one perturbation at its declared range.
+    "lost_points": {"*": {"*": at_most(5.0 + ROUNDING)}},
+}
 
 
 @dataclass(frozen=True)
@@ -582,10 +558,7 @@ def count_reached(job: Job, perturbation: str | None, times: float) -> int:
     """Counts episodes that truly succeed under a perturbation, or none."""
     model = perturbations.open_real_model(job.robot)
     world = load_world(job.world)
-    driver: Policy
-    driver, task = open_policy(job.robot, model)
-    if job.control == "standing":
-        driver = Standing(task)
+    driver, task = open_driver(job.robot, model, job.control)
     times *= TENFOLD if job.control == "tenfold" else 1.0
     larger = perturbation == "footprint"
     drawn = None
@@ -624,13 +597,8 @@ def measure_robustness(given: Given) -> Result:
     with one of them at parts and multiples of its declared range: with the greatest value that the
     randomisation of its training draws. The footprint is no part of that, and time constants need
     not be; they are declared in measuring/perturbations.py. Lidar, gate, shield and estimator are
-    those of a deployment, and know nothing of the perturbation; success is by the truth. `--of
-    RESULTS` only draws the picture of earlier runs.
+    those of a deployment, and know nothing of the perturbation; success is by the truth.
     """
-    if given.of:
-        runs = json.loads(given.of.read_text(encoding="utf-8"))["runs"]
-        perturbations.draw(collect_curves(runs), given.picture, MULTIPLES)
-        raise SystemExit(0)
     jobs = [
         Job(robot, world, given.episodes, tuple(given.only), given.control)
         for robot, world in product(given.robots, given.worlds)
@@ -648,32 +616,23 @@ def measure_robustness(given: Given) -> Result:
         robot: {each: (some / episodes).tolist() for each, some in own.items()}
         for robot, own in counts.items()
     }
-    if given.picture:
-        perturbations.draw(success, given.picture, MULTIPLES)
-    lost = find_losses(success)
     return {
         "declared": {
             robot: perturbations.describe(perturbations.load_declared(robot))
             for robot in success
         },
         "success": success,
-        "lost_points": lost,
-        "worst": find_worst(lost),
+        "unperturbed": {
+            robot: next(iter(own.values()))[0] for robot, own in success.items()
+        },
+        "lost_points": find_losses(success),
         "episodes": episodes,
     }
 
 
-def collect_curves(runs: Mapping[str, Any]) -> dict[str, dict[str, list[float]]]:
-    """Returns the success of all robots in results: robot -> perturbation -> by multiple."""
-    return {
-        robot: {each: list(some.values()) for each, some in own.items()}
-        for name, run in sorted(runs.items())
-        if name.startswith("robustness_") and run["result"]
-        for robot, own in run["result"]["success"].items()
-    }
-
-
-def find_losses(success: Curves) -> dict[str, dict[str, float]]:
+def find_losses(
+    success: Mapping[str, Any],
+) -> dict[str, dict[str, float]]:
     """Returns points of success lost at the declared range: robot -> perturbation -> value."""
     at = 1 + MULTIPLES.index(DECLARED)
     return {
@@ -684,35 +643,11 @@ def find_losses(success: Curves) -> dict[str, dict[str, float]]:
     }
 
 
-def find_worst(lost: Mapping[str, Mapping[str, float]]) -> Result:
-    """Returns the greatest loss of all, and to what."""
-    losses = (
-        (value, robot, each)
-        for robot, own in lost.items()
-        for each, value in own.items()
-    )
-    points, robot, each = max(losses)
-    return {"points": points, "robot": robot, "perturbation": each}
-
-
-def judge_robustness(result: Result) -> list[str]:
-    missed = []
-    for robot, own in result["success"].items():
-        first = {"success": next(iter(own.values()))[0]}
-        missed += missed_bars(first, {"success": LEAST_UNPERTURBED}, f"{robot}: ")
-        bars = {
-            each: at_most(MOST_LOST + ROUNDING, f"points lost to {each}")
-            for each in own
-        }
-        missed += missed_bars(result["lost_points"][robot], bars, f"{robot}: ")
-    return missed if any(result["success"].values()) else ["no policy was driven"]
-
-
 SHIPPED = some_of(list_shipped_policies())
 BENCHMARKS = {
     "training": Benchmark(
         measure_training,
-        judge_training,
+        set_training_bars,
         {
             "untrained": Control(
                 "the learning: a net that has learnt from a single rollout",
@@ -731,7 +666,7 @@ BENCHMARKS = {
     ),
     "baselines": Benchmark(
         measure_baselines,
-        judge_baselines,
+        set_baseline_bars,
         {"standing": STANDS},
         {
             "world": {"nargs": "+", "default": [LEARNING_WORLD]},
@@ -743,7 +678,7 @@ BENCHMARKS = {
     ),
     "barn": Benchmark(
         measure_barn,
-        judge_barn,
+        set_barn_bars,
         {"standing": STANDS},
         {
             "in": {"dest": "place", "choices": tuple(BARN_BARS), "default": FAST},
@@ -762,7 +697,7 @@ BENCHMARKS = {
     ),
     "transfer": Benchmark(
         measure_transfer,
-        judge_transfer,
+        set_transfer_bars,
         {
             "lying": Control("the truth: a robot says it is there", "the robot alone"),
             "standing": STANDS,
@@ -780,7 +715,7 @@ BENCHMARKS = {
     ),
     "robustness": Benchmark(
         measure_robustness,
-        judge_robustness,
+        ROBUST_BARS,
         {
             "tenfold": Control("the range: perturbations are ten times it", "drift"),
             "standing": STANDS,
@@ -790,8 +725,6 @@ BENCHMARKS = {
             "robots": SHIPPED,
             "worlds": some_of(ROBUST_WORLDS),
             "only": some_of(PERTURBATIONS),
-            "picture": {"type": Path, "help": "draw the curves into this file"},
-            "of": {"type": Path, "help": "draw the picture of these results only"},
         },
         short="--episodes 2 --robots differential --worlds circles --only drift",
         unsettled=("",),

@@ -18,18 +18,18 @@ from typing import Any
 import gymnasium
 import numpy as np
 from bench import (
+    Bars,
     Benchmark,
     Control,
     Given,
     Result,
     at_least,
     at_most,
-    missed_bars,
     run_benchmark,
 )
 from measuring import peers
 from measuring.rates import interleaved, medians, slowed
-from measuring.scenes import BATCH, CIRCLE, errors
+from measuring.scenes import BATCH, CIRCLE, Batch, errors
 from numpy.typing import NDArray
 
 from nics_drl_bridge import style
@@ -102,6 +102,15 @@ class Case:
         changes = {"size": (side, side), "obstacles": (more,)}
         return peers.WORLD.model_copy(update=changes)
 
+    def open_worlds(self, worlds: int, **further: Any) -> "Worlds":
+        """Returns a vector env, by default on one thread."""
+        return Worlds(BridgeVectorEnv(worlds, self.model, self.world, **further), self)
+
+    def open_alone(self, estimator: bool) -> "Worlds":
+        """Returns a single env."""
+        about = {"model": self.model, "world": self.world, "estimator": estimator}
+        return Alone(gymnasium.make(NAVIGATION, **about), self)
+
     def make_actions(self, space: gymnasium.Space[Any]) -> NDArray[np.float32]:
         """Returns random actions (ACTIONS, ...), or those of no motion."""
         size = (ACTIONS, *(space.shape or ()))
@@ -116,69 +125,70 @@ class Case:
 class Worlds:
     """The vector env at work."""
 
-    def __init__(self, worlds: int, threads: int, case: Case) -> None:
-        further: dict[str, Any] = {} if threads == 1 else {"threads": threads}
+    periods = CHUNK  # of a chunk
+
+    def __init__(self, env: Any, case: Case) -> None:
         self.beams = case.model.lidar.beams
-        self.env = BridgeVectorEnv(worlds, case.model, case.world, **further)
-        self.seen, _ = self.env.reset(seed=0)
-        self.actions = case.make_actions(self.env.action_space)
-        self.steps = CHUNK * worlds
+        self.env = env
+        self.actions = case.make_actions(env.action_space)
+        self.take(*env.reset(seed=0))
+
+    def take(self, seen: Any, info: Any) -> None:
+        """Keeps what the env tells: observations (N, ...)."""
+        self.seen = seen
 
     @property
     def places(self) -> NDArray[np.float64]:
         """Where the robots are (N, 2) [m]."""
-        return self.env.simulator.data.pose[:, 0, :2].copy()
+        return np.array(self.env.simulator.data.pose[:, 0, :2])
+
+    @property
+    def steps(self) -> int:
+        """Of all worlds in a chunk."""
+        return self.periods * len(self.seen)
 
     def step(self, k: int) -> int:
         """Steps all worlds; returns how many episodes ended."""
-        self.seen, _, ended, cut, _ = self.env.step(self.actions[k % ACTIONS])
-        return int((ended | cut).sum())
+        seen, _, ended, cut, info = self.env.step(self.actions[k % ACTIONS])
+        self.take(seen, info)
+        return int(np.count_nonzero(ended | cut))
 
     def run_chunk(self) -> None:
         """Makes a chunk of steps."""
-        for k in range(CHUNK):
-            self.env.step(self.actions[k % ACTIONS])
+        for k in range(self.periods):
+            self.step(k)
 
 
-class Alone:
+class Alone(Worlds):
     """Likewise the env of `gymnasium.make`, with the wrappers that it adds, reset when it ends."""
 
-    def __init__(self, estimator: bool, case: Case) -> None:
-        self.beams = case.model.lidar.beams
-        self.env = gymnasium.make(
-            NAVIGATION, model=case.model, world=case.world, estimator=estimator
-        )
-        self.actions = case.make_actions(self.env.action_space)
-        self.steps = SINGLE_CHUNK
-        self.places = np.zeros((1, 2))
-        seen, _ = self.env.reset(seed=0)
+    periods = SINGLE_CHUNK
+
+    def take(self, seen: Any, info: Any) -> None:
+        """Keeps what the env tells as of one world."""
         self.seen = seen[None]
+        self.info = info
+
+    @property
+    def places(self) -> NDArray[np.float64]:
+        """Where the robot is (1, 2) [m]."""
+        return np.array(self.info["true_pose"][None, :2])
 
     def step(self, k: int) -> int:
         """Steps the env; returns whether an episode ended."""
-        seen, _, ended, cut, info = self.env.step(self.actions[k % ACTIONS])
-        self.seen = seen[None]
-        self.places = info["true_pose"][None, :2].copy()
-        if ended or cut:
+        ended = super().step(k)
+        if ended:
             self.env.reset()
-        return int(ended or cut)
-
-    def run_chunk(self) -> None:
-        """Makes a chunk of steps."""
-        for k in range(SINGLE_CHUNK):
-            _, _, ended, cut, _ = self.env.step(self.actions[k % ACTIONS])
-            if ended or cut:
-                self.env.reset()
+        return ended
 
 
-def watch_chunk(one: Worlds | Alone) -> dict[str, float]:
+def watch_chunk(one: Worlds) -> dict[str, float]:
     """Returns what shows that robots move and see, in one more chunk."""
     moved = 0.0
     changed = 0.0
     episodes = 0
-    periods = one.steps // len(one.seen)
     begun = len(one.seen)
-    for k in range(periods):
+    for k in range(one.periods):
         seen = one.seen[:, : one.beams]
         places = one.places
         ended = one.step(k)
@@ -188,8 +198,8 @@ def watch_chunk(one: Worlds | Alone) -> dict[str, float]:
         episodes += ended
         changed += np.count_nonzero(one.seen[:, : one.beams] != seen) / len(seen)
     return {
-        "moved_m_per_period": moved / periods,
-        "beams_changed_per_period": changed / periods,
+        "moved_m_per_period": moved / one.periods,
+        "beams_changed_per_period": changed / one.periods,
         "episodes": episodes,
     }
 
@@ -225,16 +235,16 @@ def measure_throughput(given: Given) -> Result:
     # A share is told to a few percent only by more of them.
     repeats = given.repeats if rivals else 3 * given.repeats
     register_envs()
-    ours: dict[str, Worlds | Alone] = {
-        "one": Worlds(given.worlds, 1, case),
-        "all": Worlds(given.worlds, given.threads, case),
-        "plain": Alone(False, case),
-        "estimator": Alone(True, case),
+    ours = {
+        "one": case.open_worlds(given.worlds),
+        "all": case.open_worlds(given.worlds, threads=given.threads),
+        "plain": case.open_alone(estimator=False),
+        "estimator": case.open_alone(estimator=True),
     }
     if not case.is_usual:
-        ours["usual"] = Worlds(given.worlds, 1, Case())
+        ours["usual"] = Case().open_worlds(given.worlds)
     if case.lidar is not None:
-        ours["clean"] = Worlds(given.worlds, 1, replace(case, clean=True))
+        ours["clean"] = replace(case, clean=True).open_worlds(given.worlds)
     cartpole = gymnasium.make("CartPole-v1")
     cartpole.reset(seed=0)
     written = np.zeros((given.worlds, case.model.lidar.beams + 6), np.float32)
@@ -274,25 +284,22 @@ def measure_throughput(given: Given) -> Result:
     return result
 
 
-def judge_throughput(result: Result) -> list[str]:
-    bars = dict(SHARES)
+def set_throughput_bars(result: Result) -> Bars:
+    bars: dict[str, Any] = dict(SHARES)
     if "share_of_usual" in result:
         left = "left of the usual env's speed"
         bars = {"share_of_usual": at_least(result["least_share_of_usual"], left)}
     if "times_as_long_as_clean" in result:
         bars["times_as_long_as_clean"] = CLEAN
-    missed = missed_bars(result, bars) + judge_equal_work(result, AT_EQUAL_WORK)
-    for name, drove in result["drove"].items():
-        missed += peers.judge_robots(f"our env {name!r}", drove)
-    return missed
+    drove = {"drove": {"*": peers.DRIVEN}}
+    return bars | drove | set_peer_bars(result, AT_EQUAL_WORK)
 
 
-def judge_equal_work(result: Result, least: Mapping[str, float]) -> list[str]:
-    """Returns a sentence for each peer that we are not so many times as fast as, or that failed."""
+def set_peer_bars(result: Result, least: Mapping[str, float]) -> Bars:
+    """Returns bars of how many times as fast as the peers we are at least, and of what they did."""
     ratios = result["times_as_fast_at_equal_work"]
-    bars = {name: at_least(least[name]) for name in ratios}
-    missed = missed_bars(ratios, bars, "times as fast at equal work: ")
-    return missed + peers.judge(result)
+    faster = {name: at_least(least[name]) for name in ratios}
+    return {"times_as_fast_at_equal_work": faster} | peers.set_bars(result)
 
 
 # Environments as something grows
@@ -443,12 +450,12 @@ def _costs_of(result: Result, name: str) -> list[float]:
     return result["robots_us_per_robot" if name == "robots" else f"{name}_us"]
 
 
-def judge_scaling(result: Result) -> list[str]:
+def set_scaling_bars(result: Result) -> Bars:
     bars = {
         name: at_most(most, f"{name}: {result[name][-1]} cost, times {result[name][0]}")
         for name, most in MOST_TIMES.items()
     }
-    return missed_bars(result["end_to_end"], bars)
+    return {"end_to_end": bars}
 
 
 def draw_curves(result: Result, file: Path) -> None:
@@ -464,7 +471,6 @@ def draw_curves(result: Result, file: Path) -> None:
 
 # Scans beside peers
 
-RENDERERS: tuple[Renderer, ...] = ("baked", "exact")
 SCANS_AT_EQUAL_WORK = {"ir_sim": 2500.0, "irsim_x": 15.0}
 SCANS_WRITTEN = at_least(0.02, "share of the rate at which ranges can be written")
 # Against our exact scan [m]; the circles of ir-sim are polygons.
@@ -480,24 +486,23 @@ SPREAD = LidarSpec.model_validate(
 )
 
 
-class Scans:
-    """A batch of scans, each in a scene of its own."""
+def place_scans(drawn: list[Scene], turned: float = 0.0) -> Batch:
+    """Returns a scan at the start of each scene, every lidar turned [rad]."""
+    starts = np.array([scene.starts[0] for scene in drawn])
+    poses = np.zeros((len(drawn), len(drawn[0].bodies), 3))
+    poses[..., :2] = [scene.bodies[:, :2] for scene in drawn]
+    circles = (CIRCLE,) * poses.shape[1]
+    return Batch(circles, poses, starts + np.array([0.0, 0.0, turned]))
 
-    def __init__(self, table: LidarTable, drawn: list[Scene]) -> None:
-        self.table = table
-        self.starts = np.array([scene.starts[0] for scene in drawn])
-        poses = np.zeros((len(drawn), drawn[0].bodies.shape[0], 3))
-        poses[..., :2] = [scene.bodies[:, :2] for scene in drawn]
-        placed = Scanner(SPREAD, table).place((CIRCLE,) * poses.shape[1], poses)
-        self.scene = (placed, peers.WORLD.all_walls())
-        self.out = np.empty((len(drawn), SPREAD.beams), np.float32)
 
-    def render(self, renderer: Renderer, turned: float = 0.0) -> Any:
-        """Renders the batch, every lidar turned [rad]; returns ranges (N, B) [m]."""
-        scanner = Scanner(SPREAD, self.table, renderer)
-        starts = self.starts + np.array([0.0, 0.0, turned])
-        scanner.scan(starts, *self.scene, out=self.out)
-        return self.out.copy()
+def prepare_scan(
+    batch: Batch, table: LidarTable, renderer: Renderer
+) -> Callable[[], Any]:
+    """Returns a call that renders a batch among the walls and returns its ranges (N, B) [m]."""
+    scanner = Scanner(SPREAD, table, renderer)
+    scene = (batch.bodies(scanner), peers.WORLD.all_walls())
+    out = np.empty((len(batch.lidar), SPREAD.beams), np.float32)
+    return partial(scanner.scan, batch.lidar, *scene, out=out)
 
 
 def measure_lidar_peers(given: Given) -> Result:
@@ -509,19 +514,21 @@ def measure_lidar_peers(given: Given) -> Result:
     """
     rivals = () if given.without_peers else tuple(peers.PEERS)
     table = bake(SPREAD, (CIRCLE,))
-    batch = Scans(table, peers.make_scenes(given.scans))
-    calls: dict[str, Callable[[], object]] = {
-        name: slowed(partial(batch.render, name), given.control) for name in RENDERERS
+    batch = place_scans(peers.make_scenes(given.scans))
+    calls = {
+        name: slowed(prepare_scan(batch, table, name), given.control)
+        for name in ("baked", "exact")
     }
-    calls["write"] = partial(batch.out.fill, 1.0)
+    written = np.empty((given.scans, SPREAD.beams), np.float32)
+    calls["write"] = partial(written.fill, 1.0)
     drawn = peers.make_scenes(given.scenes)
     found = peers.measure(calls, rivals, drawn, given.repeats)
     rate = {name: given.scans / seconds for name, seconds in found.seconds.items()}
     theirs = {name: 1.0 / one["scan_s"] for name, one in found.peers.items()}
-    few = Scans(table, drawn)
     turned = SPREAD.angle_increment if given.control == "shifted" else 0.0
-    exact = few.render("exact", turned=turned)
-    ranges = {"baked": few.render("baked"), **found.ranges}
+    exact = prepare_scan(place_scans(drawn, turned), table, "exact")()
+    baked = prepare_scan(place_scans(drawn), table, "baked")()
+    ranges = {"baked": baked, **found.ranges}
     return {
         "times_as_fast_at_equal_work": {
             name: rate["baked"] / one for name, one in theirs.items()
@@ -535,11 +542,12 @@ def measure_lidar_peers(given: Given) -> Result:
     }
 
 
-def judge_lidar_peers(result: Result) -> list[str]:
-    bars = {name: at_most(SCAN_RMSE_M[name]) for name in result["rmse_m"]}
-    missed = missed_bars(result, {"share_of_write_limit": SCANS_WRITTEN})
-    missed += missed_bars(result["rmse_m"], bars, "RMSE [m]: ")
-    return missed + judge_equal_work(result, SCANS_AT_EQUAL_WORK)
+def set_lidar_bars(result: Result) -> Bars:
+    return {
+        "share_of_write_limit": SCANS_WRITTEN,
+        "rmse_m": {name: at_most(SCAN_RMSE_M[name]) for name in result["rmse_m"]},
+        **set_peer_bars(result, SCANS_AT_EQUAL_WORK),
+    }
 
 
 # Steps over ROS 2
@@ -611,12 +619,12 @@ WITHOUT_PEERS = (False, "install nothing")
 BENCHMARKS = {
     "env_throughput": Benchmark(
         measure_throughput,
-        judge_throughput,
+        set_throughput_bars,
         {
             "slow": Control("the speed: each step is made ten times", "share of"),
             "standing": Control(
                 "the motion: the robots stand still",
-                "our env 'one': moved_m_per_period",
+                "drove: one: moved_m_per_period",
             ),
         },
         {
@@ -632,7 +640,7 @@ BENCHMARKS = {
     ),
     "env_scaling": Benchmark(
         measure_scaling,
-        judge_scaling,
+        set_scaling_bars,
         {
             "quadratic": Control(
                 "the search for what is near: each robot looks at each other, in Python",
@@ -649,10 +657,10 @@ BENCHMARKS = {
     ),
     "lidar_peers": Benchmark(
         measure_lidar_peers,
-        judge_lidar_peers,
+        set_lidar_bars,
         {
             "shifted": Control(
-                "the same scan: the exact one is turned by one beam", "RMSE [m]: baked"
+                "the same scan: the exact one is turned by one beam", "rmse_m: baked"
             ),
             "slow": Control("the speed: each scan is made ten times", "share of"),
         },

@@ -37,23 +37,17 @@ def clean() -> dict[str, str]:
     }
 
 
-def inherit_for_newcomer() -> dict[str, str]:
-    """The environment variables of a user who has installed nothing of ours yet.
+def inherit_for_newcomer(folder: Path) -> dict[str, str]:
+    """Returns the environment variables of a user who has installed nothing of ours yet.
 
-    The ROS 2 wheels set variables that would lead child processes to wrong libraries.
+    Temporary files go into the folder. The ROS 2 wheels set variables that would lead child
+    processes to wrong libraries.
     """
-    left_out = {*OF_OUR_OWN, "VIRTUAL_ENV"}
+    left_out = {*OF_OUR_OWN, "VIRTUAL_ENV", "MAKEFLAGS"}
     if "ROS_DISTRO" in os.environ:
         left_out -= {"LD_LIBRARY_PATH", "PYTHONPATH"}
     kept = {name: value for name, value in os.environ.items() if name not in left_out}
-    return kept | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-
-
-def newcomer(folder: Path) -> dict[str, str]:
-    """The environment variables of a newcomer, with temporary files in a folder."""
-    kept = inherit_for_newcomer() | {"TMPDIR": str(folder)}
-    kept.pop("MAKEFLAGS", None)
-    return kept
+    return kept | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "TMPDIR": str(folder)}
 
 
 def wait_for(

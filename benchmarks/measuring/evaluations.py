@@ -22,8 +22,11 @@ from numpy.typing import NDArray
 from nics_drl_bridge.commands import episodes
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.task import Task, still
+from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.middleware import Middleware
+from nics_drl_bridge.policy.file.stateful import Policy
+from nics_drl_bridge.policy.policies import open_policy
 
 AT_ONCE = 2
 
@@ -86,6 +89,14 @@ class Standing:
         """The same action for every observation (..., O)."""
         lead = observation.shape[:-1]
         return np.broadcast_to(self._action, (*lead, *self._action.shape)).copy()
+
+
+def open_driver(
+    name: str, model: SimulatorModel, control: str | None
+) -> tuple[Policy, Task]:
+    """Returns a policy by name and its task; under the control `standing` it stands still."""
+    policy, task = open_policy(name, model)
+    return (Standing(task) if control == "standing" else policy), task
 
 
 def standing_action(env: gymnasium.Env[Any, Any]) -> NDArray[Any]:

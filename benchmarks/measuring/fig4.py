@@ -58,10 +58,10 @@ def make_path(scans: int) -> Array:
     return np.stack([x, y, np.arctan2(1.8 * np.cos(t), -2.7 * np.sin(t))], axis=1)
 
 
-def let_drift(poses: Array, seed: int) -> Array:
+def let_drift(poses: Array) -> Array:
     """(N, 3) the path as an odometry that overrates speed and turning, and is noisy."""
     moves = geometry.log(geometry.between(poses[:-1], poses[1:]))
-    noise = np.random.default_rng(seed).normal(size=moves.shape) * ODOMETRY_NOISE
+    noise = np.random.default_rng(0).normal(size=moves.shape) * ODOMETRY_NOISE
     odometry = [poses[0]]
     for move in moves * DRIFT + noise:
         odometry.append(geometry.compose(odometry[-1], geometry.exp(move)))

@@ -17,13 +17,14 @@ import json
 import subprocess
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from bench import at_least, missed_bars
+from bench import Silence, at_least
 
 from measuring.environments import NotInstalledError, clean, python_with
 from nics_drl_bridge.defaults import EPISODE_STEPS
@@ -35,7 +36,6 @@ from nics_drl_bridge.sim.world import World
 WITH = ("numpy==2.4.6", "shapely==2.2.0", "matplotlib==3.11.2")
 PEERS = {"ir_sim": ("ir-sim==2.12.0", *WITH), "irsim_x": ("irsim-x==1.1.4", *WITH)}
 SCRIPT = Path(__file__).resolve().parent / "irsim_peer.py"
-READINGS = ("scan", "period")
 MODEL = open_model("differential")
 RADIUS = 0.15
 CIRCLES = 10
@@ -82,9 +82,7 @@ class Peer:
     process: subprocess.Popen[str]
     log: IO[str]
     ranges: np.ndarray = field(default_factory=lambda: np.empty((0, 0), np.float32))
-    times: dict[str, list[float]] = field(
-        default_factory=lambda: {name: [] for name in READINGS}
-    )
+    times: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     drove: dict[str, float] = field(default_factory=dict)
 
     def answer(self) -> dict[str, Any]:
@@ -105,8 +103,8 @@ class Peer:
         self.process.stdin.flush()
         told = self.answer()
         self.drove = {name: value for name, value in told.items() if name != "times"}
-        for name in READINGS if counts else ():
-            self.times[name] += told["times"][name]
+        for name, each in told["times"].items() if counts else ():
+            self.times[name] += each
 
     def close(self) -> None:
         """Ends the process."""
@@ -259,14 +257,9 @@ def measure(
     return found
 
 
-def judge(result: Mapping[str, Any]) -> list[str]:
-    """Returns the bars of the peers that were missed; those that can't be installed miss none."""
-    missed = list(result["failed"].values())
-    for name, one in result["peer_readings"].items():
-        missed += judge_robots(name, one)
-    return missed
-
-
-def judge_robots(who: str, drove: Mapping[str, float]) -> list[str]:
-    """Returns the bars that robots miss which stand still or see nothing."""
-    return missed_bars(drove, DRIVEN, f"{who}: ")
+def set_bars(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the bars of the peers; those that can't be installed have none."""
+    return {
+        "failed": dict.fromkeys(result["failed"], Silence()),
+        "peer_readings": dict.fromkeys(result["peer_readings"], DRIVEN),
+    }

@@ -1,15 +1,11 @@
-"""Perturbations of a policy's robot, one at a time, and the picture of what they cost."""
+"""Perturbations of a policy's robot, one at a time."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import cycle
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nics_drl_bridge import style
-from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.spec import load_lidar
@@ -21,7 +17,6 @@ PERTURBATIONS = ("noise", "drop-out", "latency", "response", "drift", "footprint
 LIDAR = "rplidar_a2"  # of a robot that has none of its own
 FOOTPRINT = 0.05  # how much larger the outline is than the policy and the gate believe
 RESPONSE = 1.25  # how many times as long the time constants are at least
-Curves = Mapping[str, Mapping[str, Sequence[float]]]
 
 
 def load_declared(robot: str) -> Randomisation:
@@ -109,37 +104,3 @@ def open_real_model(robot: str) -> SimulatorModel:
         return model
     lidar = load_lidar(LIDAR)
     return replace(model, lidar=lidar, table=bake(lidar, model.table.shapes))
-
-
-def draw(success: Curves, file: Path, multiples: Sequence[float]) -> None:
-    """Draws a panel for each perturbation: success over multiples of its range, by robot."""
-    amounts = [describe(load_declared(robot)) for robot in success]
-    names = list(dict.fromkeys(each for own in success.values() for each in own))
-    rows = -(-len(names) // 3)
-    where = np.array([0.0, *multiples])
-    figure, grid = style.make_panels(
-        rows, 3, (10.0, 2.8 * rows), sharex=True, sharey=True
-    )
-    for axes, each in zip(grid, names, strict=False):
-        for (robot, own), marker in zip(success.items(), cycle(style.MARKERS)):
-            share = 100.0 * np.array(
-                own[each], np.float64
-            )  # None where it was not driven
-            driven = ~np.isnan(share)
-            axes.plot(
-                where[driven], share[driven], marker=marker, markersize=4, label=robot
-            )
-        axes.axvline(1.0, color=style.OTHER, linestyle="--", linewidth=1.0)
-        told = " / ".join(dict.fromkeys(some[each] for some in amounts))
-        axes.set_title(f"{each}\n{told}")
-    for axes in grid[-3:]:
-        axes.set_xlabel("multiple of the declared range")
-        axes.set_xticks(where)
-    for axes in grid[::3]:
-        axes.set_ylabel("success [%]")
-    shares = [
-        share for own in success.values() for some in own.values() for share in some
-    ]
-    least = 100.0 * np.nanmin(np.array(shares, np.float64))
-    grid[0].set_ylim(max(0.0, 5.0 * np.floor(least / 5.0) - 5.0), 102.0)
-    write_bytes(file, style.render_png(figure, grid[0]))

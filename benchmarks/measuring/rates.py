@@ -9,9 +9,15 @@ import numpy as np
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, run, simulate_rollouts
+from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 WARM_UP = 3
+ROUNDS = 5
+ROBOTS = 1024
+HOLDS = 20
+HOLD_S = 0.1  # for which a robot of many keeps a command
+SINGLE_STEPS = 50_000
 Name = TypeVar("Name", bound=Hashable)
 
 
@@ -55,6 +61,37 @@ def medians(times: Mapping[Name, list[float]]) -> dict[Name, float]:
 def shortest(times: Mapping[Name, list[float]]) -> dict[Name, float]:
     """The shortest time of each call [s]: what others do on the machine only ever adds."""
     return {name: min(each) for name, each in times.items()}
+
+
+def measure_speeds(
+    model: TaylorModel,
+    spec: RobotSpec,
+    others: Mapping[str, tuple[Callable[[], object], float]],
+) -> dict[str, float]:
+    """Returns simulated seconds per second: `batched`, `single`, and of other calls, all in turn.
+
+    Args:
+        model: whose robots are driven by random commands: many at once, and one alone.
+        spec: of the robot.
+        others: a call by its name, and how much time it simulates [s].
+    """
+    rng = np.random.default_rng(7)
+    low = spec.command_low
+    high = spec.command_high
+    many = rng.uniform(low[:, None], high[:, None], (HOLDS, len(low), ROBOTS))
+    alone = rng.uniform(low, high, (1, SINGLE_STEPS, len(low)))
+    batched, ends = make_batched(model, many, round(HOLD_S / model.dt))
+    single, poses = make_single(model, alone)
+    timed = {
+        "batched": (batched, ROBOTS * HOLDS * HOLD_S),
+        "single": (single, SINGLE_STEPS * model.dt),
+        **others,
+    }
+    calls = {name: call for name, (call, _) in timed.items()}
+    seconds = shortest(interleaved(calls, ROUNDS))
+    if not (np.isfinite(ends).all() and np.isfinite(poses).all()):
+        seconds |= dict.fromkeys(("batched", "single"), np.nan)  # fast and worthless
+    return {name: lasted / seconds[name] for name, (_, lasted) in timed.items()}
 
 
 def make_batched(

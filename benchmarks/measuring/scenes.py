@@ -57,15 +57,14 @@ def random_batch(
     scans: int,
     seed: int,
     spec: LidarSpec = SPEC,
-    obstacles: int = OBSTACLES,
 ) -> Batch:
     """Obstacles anywhere within the lidar's range, none of them nearer than its least one.
 
     They may overlap each other, and take turns when there are several shapes.
     """
     rng = np.random.default_rng([2024, seed])
-    shapes = tuple(shapes[k % len(shapes)] for k in range(obstacles))
-    poses = np.empty((scans, obstacles, 3))
+    shapes = tuple(shapes[k % len(shapes)] for k in range(OBSTACLES))
+    poses = np.empty((scans, OBSTACLES, 3))
     for k, shape in enumerate(shapes):
         wanting = np.arange(scans)
         while len(wanting):

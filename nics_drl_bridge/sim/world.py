@@ -293,7 +293,7 @@ class World(Schema):
 
 
 def plan_arrays(
-    motions: Sequence[Patrol | Pedestrian | None],
+    motions: Sequence[Motion | None],
 ) -> tuple[Records, Array]:
     """Return the plans (K,) of obstacles with these motions, and patrols' waypoints (Q, 2)."""
     plans = np.zeros(len(motions), PLAN)

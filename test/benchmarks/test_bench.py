@@ -175,11 +175,19 @@ def test_a_file_that_holds_no_results_is_not_written_over(tmp_path, content):
 def test_a_figure_that_is_too_large_or_no_number_misses_its_bar(figure):
     import bench
 
-    bars = {"loss": bench.at_most(2.0, "loss [%]")}
-    assert bench.missed_bars({"loss": 2.0}, bars) == []
-    (line,) = bench.missed_bars({"loss": figure}, bars, "car: ")
+    bars = {"*": {"loss": bench.at_most(2.0, "loss [%]")}}
+    assert bench.find_missed({"car": {"loss": 2.0}}, bars) == []
+    (line,) = bench.find_missed({"car": {"loss": figure}}, bars)
     assert line == f"car: loss [%] {figure:g}: must be at most 2"
-    assert bench.missed_bars({"loss": math.nan}, {"loss": bench.at_least(0.0)})
+    assert bench.find_missed({"loss": math.nan}, {"loss": bench.at_least(0.0)})
+
+
+def test_nothing_measured_and_a_failure_that_is_told_miss_their_bars():
+    import bench
+
+    bars = {"robots": {"*": bench.at_least(1.0)}, "failed": bench.Silence()}
+    missed = bench.find_missed({"robots": {}, "failed": "no lidar"}, bars)
+    assert missed == ["robots: nothing was measured", "failed: no lidar"]
 
 
 def test_only_figures_that_a_table_shows_are_kept():

@@ -30,6 +30,7 @@ NAN = float("nan")
 
 
 sys.path.insert(0, str(BENCHMARKS))
+find_missed = import_module("bench").find_missed
 
 # Drives of robots of other simulators
 
@@ -62,13 +63,13 @@ def test_the_csv_of_a_foreign_robot_reads_as_its_recording(foreign, tmp_path, na
     ids=str,
 )
 def test_a_drive_misses_a_bar_by_one_figure(change):
-    bars = import_module("measuring.drives")
-    limits = bars.Bars(share=0.03, error_m=0.03)
+    drives = import_module("measuring.drives")
+    limits = drives.Limits(share=0.03, error_m=0.03)
     shares = {"share_of_path": 0.02, "yardstick_share": 0.03}
     good = {**shares, "error_m": 0.02, "constant_twist_share": 0.5}
     good["coverage_95"] = 0.95
-    assert bars.judge_drive("one", good, limits) == []
-    assert len(bars.judge_drive("one", good | change, limits)) == 1
+    for told, missed in ((good, 0), (good | change, 1)):
+        assert len(find_missed(told, drives.set_bars(told, limits))) == missed
 
 
 def test_every_mapping_that_is_shown_has_its_drive():
@@ -176,8 +177,9 @@ def test_a_peer_that_crashes_or_ends_is_a_missed_bar_and_no_hang(
     monkeypatch.setattr(peers, "SCRIPT", broken)
     monkeypatch.setattr(peers, "python_with", lambda *_: sys.executable)
     found = peers.measure({}, ["ir_sim"], peers.make_scenes(1), 1)
-    (missed,) = peers.judge(found.describe())
-    assert missed.startswith("ir_sim failed")
+    told = found.describe()
+    (missed,) = find_missed(told, peers.set_bars(told))
+    assert missed.startswith("failed: ir_sim: ir_sim failed")
 
 
 # Policies
@@ -227,15 +229,17 @@ def test_success_has_a_floor_and_may_be_two_and_four_points_off(
     policies, places, believed, length, bars
 ):
     shares = dict(zip(("fast", "dds", "mujoco_dds"), places, strict=True))
-    told = {place: share + believed for place, share in shares.items()}
     figures = {
-        "success": shares,
-        "believed": told,
-        "length": dict.fromkeys(shares, length),
-        "points_from_fast": policies.find_points(shares),
+        place: {
+            "success": [share],
+            "believed": [share + believed],
+            "collision": [0.0],
+            "length": [length],
+        }
+        for place, share in shares.items()
     }
-    result = {key: {"jackal": {"circles": one}} for key, one in figures.items()}
-    assert len(policies.judge_transfer(result)) == bars
+    result = policies.tabulate_transfer({"jackal": {"circles": figures}})
+    assert len(find_missed(result, policies.set_transfer_bars(result))) == bars
 
 
 MILD = load_randomisation("mild")

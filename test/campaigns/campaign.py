@@ -20,13 +20,15 @@ sys.path += [str(ROOT / "benchmarks"), str(ROOT / "test")]
 
 from bench import (  # noqa: E402
     Bar,
+    Bars,
     Benchmark,
     Control,
     Given,
     Result,
+    Silence,
     at_least,
     at_most,
-    missed_bars,
+    find_missed,
     some_of,
 )
 
@@ -35,11 +37,14 @@ __all__ = [
     "FOLDER",
     "NAV2_SOURCES",
     "ROOT",
+    "Bar",
+    "Bars",
     "Given",
     "Result",
+    "Silence",
     "at_least",
     "at_most",
-    "missed_bars",
+    "find_missed",
     "run_campaign",
     "some_of",
     "tell",
@@ -267,7 +272,7 @@ CAMPAIGNS: dict[str, Campaign] = {
             "standing": Control("the commands: no robot drives", ": driven_m 0"),
             "deaf": Control(
                 "the topics of one robot, which nobody receives",
-                "robot2 of 2: scan 0:",
+                "robot2: scan 0:",
                 "--robots 2 --seconds 2 --patience 15",
             ),
         },
@@ -297,7 +302,7 @@ CAMPAIGNS: dict[str, Campaign] = {
             ),
             "leak": Control(
                 "order: each episode leaves a file open",
-                "files_growth ",
+                "growth: files: env ",
                 "--minutes 0.2 --warm-up 0.0",
             ),
         },
@@ -333,7 +338,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         {
             "claims": Control(
                 "conformance: a feature that is not there counts as announced",
-                "sim_conformance_failed 1",
+                "is announced, but",
             ),
             "idle": Control(
                 "conformance: nothing is done, and all is answered as done",
@@ -406,7 +411,7 @@ def tell(line: str) -> None:
 
 def run_campaign(
     measure: Callable[[Given], Result],
-    judge: Mapping[str, Bar] | Callable[[Result], list[str]],
+    bars: Bars | Callable[[Result], Bars],
     options: Mapping[str, Any] | None = None,
 ) -> NoReturn:
     """Runs the campaign whose script is running, as a benchmark with its controls and short form.
@@ -416,5 +421,5 @@ def run_campaign(
     script = Path(sys.argv[0]).stem
     own = [each for name, each in CAMPAIGNS.items() if (each.script or name) == script]
     controls = {name: taken for each in own for name, taken in each.controls.items()}
-    campaign = Benchmark(measure, judge, controls, options or {}, own[0].short)
+    campaign = Benchmark(measure, bars, controls, options or {}, own[0].short)
     campaign.run(sys.argv[1:], sys.modules["__main__"].__doc__)

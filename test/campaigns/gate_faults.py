@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from campaign import Given, Result, at_least, at_most, missed_bars, run_campaign, tell
+from campaign import Bars, Given, Result, at_least, at_most, run_campaign, tell
 from parts.processes import keep_busy
 
 from nics_drl_bridge.nodes.gate_faults import FAULTS, LATE_S, Setup, inject_all
@@ -39,18 +39,17 @@ CHANGES = {
 }
 
 
-def judge(result: Result) -> list[str]:
-    missed = []
+def set_bars(result: Result) -> Bars:
+    bars = {}
     for name, figures in result.items():
-        bars = {
+        bars[name] = {
             "n": at_least(figures["asked"], "injections while the robot moved"),
             "max_s": at_most(figures["limit_s"], "time to zero [s]"),
             "unsafe_commands": at_most(0),
         }
         if figures["limit_s"] == LATE_S:
-            bars["p50_s"] = at_most(MEDIAN_S, "median time to zero [s]")
-        missed += missed_bars(figures, bars, f"{name}: ")
-    return missed
+            bars[name]["p50_s"] = at_most(MEDIAN_S, "median time to zero [s]")
+    return bars
 
 
 def measure(given: Given) -> Result:
@@ -83,4 +82,4 @@ OPTIONS = {
 }
 
 if __name__ == "__main__":
-    run_campaign(measure, judge, OPTIONS)
+    run_campaign(measure, set_bars, OPTIONS)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from campaign import Given, Result, at_least, at_most, missed_bars, run_campaign, tell
+from campaign import Bars, Given, Result, at_least, at_most, run_campaign, tell
 from parts.held_body import RULE, Case, Tally, drive_freely, hold_bodies
 
 from nics_drl_bridge.gate import scan_motion
@@ -91,9 +91,9 @@ def measure(given: Given) -> Result:
     }
 
 
-def judge(result: Result) -> list[str]:
+def set_bars(result: Result) -> Bars:
     hours, holds = result["asked"]
-    bars = {
+    return {
         "trips": at_most(0, f"stops by {RULE} of robots that drove freely"),
         "hours": at_least(0.99 * hours, "invalid: hours that were driven"),
         "judged_share": at_least(LEAST_JUDGED, "invalid: time in which scans told"),
@@ -102,7 +102,6 @@ def judge(result: Result) -> list[str]:
             LEAST_STOPPED, "share of the held bodies that were stopped in time"
         ),
     }
-    return missed_bars(result, bars)
 
 
 OPTIONS = {
@@ -113,4 +112,4 @@ OPTIONS = {
 }
 
 if __name__ == "__main__":
-    run_campaign(measure, judge, OPTIONS)
+    run_campaign(measure, set_bars, OPTIONS)

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from typing import NoReturn
 
-from campaign import ROOT, Given, Result, run_campaign
+from campaign import ROOT, Bars, Given, Result, Silence, at_least, run_campaign
 
 from nics_drl_bridge.gate import arming, evidence, gate, intake, stops
 
@@ -90,15 +90,20 @@ def measure(given: Given) -> Result:
     asked = given.rule or known
     if is_untested:
         asked = [f"stop/{UNTESTED}"]
-    untested = [name for name in asked if not tests_fail_without(name, given)]
+    untested = {
+        f"rule {name}": "no test misses it"
+        for name in asked
+        if not tests_fail_without(name, given)
+    }
     return {"rules": len(known), "looked_at": len(asked), "untested": untested}
 
 
-def judge(result: Result) -> list[str]:
-    missed = [f"no test misses the rule {name}" for name in result["untested"]]
-    if result["rules"] < LEAST_RULES or not result["looked_at"]:
-        missed.append(f"{result['rules']} rules, {result['looked_at']} looked at")
-    return missed
+def set_bars(result: Result) -> Bars:
+    return {
+        "rules": at_least(LEAST_RULES),
+        "looked_at": at_least(1),
+        "untested": dict.fromkeys(result["untested"], Silence()),
+    }
 
 
 OPTIONS = {
@@ -108,4 +113,4 @@ OPTIONS = {
 }
 
 if __name__ == "__main__":
-    run_campaign(measure, judge, OPTIONS)
+    run_campaign(measure, set_bars, OPTIONS)

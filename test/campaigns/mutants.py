@@ -13,7 +13,7 @@ because busy machines fail tests too. Tests that fail without a mutant are left 
 of other rings.
 
 The output has one JSON object per line: the run, each room without a mutant, and each mutant with
-its outcome. `--resume` continues an interrupted run. Controls go through the same steps:
+its outcome. The same command continues an interrupted run. Controls go through the same steps:
 `--control unchanged` has to survive, `--control raises` has to be killed.
 """
 
@@ -38,6 +38,8 @@ from dataclasses import asdict, dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from parts.book import Book
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "nics_drl_bridge"
@@ -582,28 +584,6 @@ def key_of(record: dict[str, Any]) -> str:
     )
 
 
-def read_records(out: Path, run: dict[str, Any], resume: bool) -> list[dict[str, Any]]:
-    """Returns what an earlier run has written, if this run continues it."""
-    if not out.exists():
-        return []
-    if not resume:
-        raise SystemExit(f"mutants: {out} exists; continue it by --resume, or move it.")
-    records = []
-    for line in out.read_text(encoding="utf-8").splitlines():
-        try:
-            records.append(json.loads(line))
-        except ValueError:  # the run ended while it wrote this line
-            continue
-    earlier = records[0]
-    for name in ("seed", "control", "digest"):
-        if earlier[name] != run[name]:
-            fix = "take another --out"
-            raise SystemExit(
-                f"mutants: {out} has {name} {earlier[name]}, not {run[name]}; {fix}."
-            )
-    return records
-
-
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seed", type=int, default=54, help="of the draw")
@@ -612,7 +592,6 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--rooms", nargs="+", choices=ROOMS, default=ROOMS, help="in this order"
     )
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "mutants.jsonl")
-    parser.add_argument("--resume", action="store_true", help="continue --out")
     parser.add_argument("--control", choices=CONTROLS, help="instead of mutants")
     parser.add_argument("--list", action="store_true", help="list the mutants only")
     return parser.parse_args(arguments)
@@ -638,29 +617,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         laboratory = Laboratory(Path(folder), ROOT)
         run = {
-            "record": "run",
             "seed": asked.seed,
             "control": asked.control,
             "digest": compute_digest(laboratory.snapshot),
             "isolated": laboratory.isolated,
         }
-        records = read_records(asked.out, run, asked.resume)
         asked.out.parent.mkdir(parents=True, exist_ok=True)
-        with asked.out.open("a", encoding="utf-8") as file:
-
-            def write(record: dict[str, Any]) -> None:
-                records.append(record)
-                file.write(json.dumps(record) + "\n")
-                file.flush()
-
-            if not records:
-                write(run)
-            laboratory.warm_up()
-            for room in asked.rooms:
-                own = [mutant for mutant in mutants if mutant.room == room]
-                test_room(laboratory, room, own, records, write)
+        book = Book(asked.out, run)
+        laboratory.warm_up()
+        for room in asked.rooms:
+            own = [mutant for mutant in mutants if mutant.room == room]
+            test_room(laboratory, room, own, book)
     keys = {mutant.key for mutant in mutants}
-    results = [x for x in records if x["record"] == "mutant" and key_of(x) in keys]
+    results = [x for x in book.rows if x["record"] == "mutant" and key_of(x) in keys]
     print(summarise(results, asked.rooms))
     expected = CONTROLS.get(asked.control)
     return int(expected is not None and {x["outcome"] for x in results} != {expected})
@@ -670,27 +639,26 @@ def test_room(
     laboratory: Laboratory,
     room: str,
     mutants: Sequence[Mutant],
-    records: Sequence[dict[str, Any]],
-    write: Callable[[dict[str, Any]], None],
+    book: Book,
 ) -> None:
     """Runs those mutants of a room that have no record yet."""
-    done = {key_of(record) for record in records if record["record"] == "mutant"}
+    done = {key_of(row) for row in book.rows if row["record"] == "mutant"}
     left = [mutant for mutant in mutants if mutant.key not in done]
     if not left:
         return
-    earlier = [x for x in records if x["record"] == "clean" and x["room"] == room]
+    earlier = [x for x in book.rows if x["record"] == "clean" and x["room"] == room]
     if earlier:
         clean = Clean(earlier[0]["seconds"], earlier[0]["failed"])
     else:
         clean = laboratory.run_clean(room)
-        write({"record": "clean", "room": room, **clean._asdict()})
+        book.add([{"record": "clean", "room": room, **clean._asdict()}])
     print(
         f"{room}: {clean.seconds:.0f} s, fail without a mutant: {clean.failed}",
         flush=True,
     )
     for mutant in left:
         record = laboratory.run_mutant(mutant, clean)
-        write({"record": "mutant", **record})
+        book.add([{"record": "mutant", **record}])
         place = f"{record['file']}:{record['line']} {record['kind']}"
         print(f"{record['outcome']:<10} {record['seconds']:>6} s  {place}", flush=True)
 

@@ -21,15 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from campaign import (
-    Given,
-    Result,
-    at_most,
-    missed_bars,
-    run_campaign,
-    some_of,
-    tell,
-)
+from campaign import Bars, Given, Result, at_most, run_campaign, some_of, tell
 from parts.processes import keep_busy, make_environment
 
 from nics_drl_bridge.nodes.parameters import NODES
@@ -164,17 +156,17 @@ def measure(given: Given) -> Result:
     return {"times": given.times, "loops": given.loops, "endings": found}
 
 
-def judge(result: Result) -> list[str]:
-    missed = []
-    for name, figures in result["endings"].items():
-        bars = {
-            "longest_s": at_most(LIMIT_S, "took [s]"),
-            "failed": at_most(0, "ended badly"),
-        }
-        if name.endswith("starting") and not result["loops"]:
-            bars["reached_s"] = at_most(FIRST_LINE_S, "its first line took [s]")
-        missed += missed_bars(figures, bars, f"{name}: ")
-    return missed
+def set_bars(result: Result) -> Bars:
+    each = {
+        "longest_s": at_most(LIMIT_S, "took [s]"),
+        "failed": at_most(0, "ended badly"),
+    }
+    first = {"reached_s": at_most(FIRST_LINE_S, "its first line took [s]")}
+    bars = {}
+    for name in result["endings"]:
+        is_first = name.endswith("starting") and not result["loops"]
+        bars[name] = each | first if is_first else each
+    return {"endings": bars}
 
 
 OPTIONS = {
@@ -185,4 +177,4 @@ OPTIONS = {
 }
 
 if __name__ == "__main__":
-    run_campaign(measure, judge, OPTIONS)
+    run_campaign(measure, set_bars, OPTIONS)

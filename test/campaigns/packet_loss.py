@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from campaign import FOLDER, Given, Result, at_least, at_most, missed_bars, run_campaign
+from campaign import FOLDER, Bar, Bars, Given, Result, at_least, at_most, run_campaign
+from gate_faults import HIGH, LOW, ROBOT, TWIST
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from parts.lossy_link import Link, NoNamespacesError, open_link
@@ -37,10 +38,6 @@ from nics_drl_bridge.nodes.faulty_robot import PERIOD_S, Robot
 from nics_drl_bridge.nodes.processes import NodeProcess
 from nics_drl_bridge.nodes.spun_node import SpunNode
 
-ROBOT = "ackermann"
-TWIST = np.array([0.5, 0.0, 0.1])
-LOW = np.array([0.0, 0.0, -0.5])
-HIGH = np.array([1.0, 0.0, 0.5])
 LOSSES = (5, 20)
 # the gate's limit of 0.35 s, and what its tick (0.02 s) and the way to the robot may add
 OLDEST_S = 0.40
@@ -199,14 +196,11 @@ def measure_loss(
     }
 
 
-def judge_loss(name: str, figures: dict[str, Any]) -> list[str]:
-    """Returns a sentence for each bar that a loss missed."""
+def set_loss_bars(figures: dict[str, Any]) -> Bars:
+    """Returns the bars of one loss."""
     low, high = (share * figures["scans_asked"] for share in SENT_SHARES)
-    sent = "invalid: scans that the robot sent"
-    figures = figures | {"most_sent": figures["scans_sent"]}
-    bars = {
-        "scans_sent": at_least(low, sent),
-        "most_sent": at_most(high, sent),
+    return {
+        "scans_sent": Bar(low, high, "invalid: scans that the robot sent"),
         "scans_arrived": at_most(
             figures["scans_sent"] - 1, "invalid: none was lost: scans that arrived"
         ),
@@ -214,7 +208,6 @@ def judge_loss(name: str, figures: dict[str, Any]) -> list[str]:
         "worst_age_s": at_most(OLDEST_S, "age of the data behind a motion [s]"),
         "unsafe_commands": at_most(0),
     }
-    return missed_bars(figures, bars, f"{name}: ")
 
 
 def measure(given: Given) -> Result:
@@ -232,9 +225,8 @@ def measure(given: Given) -> Result:
     return {"runs": runs}
 
 
-def judge(result: Result) -> list[str]:
-    runs = result["runs"].items()
-    return [line for name, one in runs for line in judge_loss(name, one)]
+def set_bars(result: Result) -> Bars:
+    return {"runs": {name: set_loss_bars(one) for name, one in result["runs"].items()}}
 
 
 OPTIONS = {
@@ -243,4 +235,4 @@ OPTIONS = {
 }
 
 if __name__ == "__main__":
-    run_campaign(measure, judge, OPTIONS)
+    run_campaign(measure, set_bars, OPTIONS)

@@ -17,7 +17,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 
-from campaign import Given, Result, at_least, at_most, missed_bars, run_campaign, tell
+from campaign import Bars, Given, Result, at_least, at_most, run_campaign, tell
 from parts.braking import measure_braking
 
 from nics_drl_bridge.gate.assurance import episodes
@@ -79,11 +79,11 @@ def drive(
     return tried, [outcome for outcome in found if outcome.kind == POLICY]
 
 
-def judge(result: Result) -> list[str]:
+def set_bars(result: Result) -> Bars:
     asked = result["asked"]
     least_contacts = max(1.0, LEAST_CONTACTS_WITHOUT * result["tried_without"])
     least_goals = max(1.0, LEAST_GOALS * result["goals_reached_without"])
-    bars = {
+    return {
         "contacts": at_most(0, "contacts of robots in motion"),
         "episodes": at_least(max(asked, 1), "episodes driven"),
         "path_m": at_least(LEAST_PATH * asked, "path driven [m]"),
@@ -94,7 +94,6 @@ def judge(result: Result) -> list[str]:
             1.0, "braking distance in parts of what the shield keeps free"
         ),
     }
-    return missed_bars(result, bars)
 
 
 def measure(given: Given) -> Result:
@@ -140,4 +139,4 @@ OPTIONS = {
 }
 
 if __name__ == "__main__":
-    run_campaign(measure, judge, OPTIONS)
+    run_campaign(measure, set_bars, OPTIONS)

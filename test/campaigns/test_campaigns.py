@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -80,6 +81,24 @@ def test_a_control_misses_its_bar(name, control):
     code, missed = run(name, "--control", control, *short.split())
     assert code == 1
     assert any(taken.bar in line for line in missed), missed
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param("transfer", marks=marks_of(CAMPAIGNS["transfer"], False))]
+)
+def test_a_killed_run_goes_on_to_the_same_result(name, tmp_path):
+    script = str(FOLDER / f"{name}.py")
+    words = [sys.executable, script, "--json", *CAMPAIGNS[name].short.split(), "--out"]
+    whole = subprocess.run([*words, tmp_path / "whole"], capture_output=True)
+    killed = tmp_path / "killed"
+    with subprocess.Popen(
+        [*words, killed], stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        next(line for line in process.stderr if line.startswith("1 of 3"))
+        os.killpg(process.pid, signal.SIGKILL)
+    rest = subprocess.run([*words, killed], capture_output=True, text=True)
+    assert "of 3" not in rest.stderr
+    assert rest.stdout == whole.stdout.decode() != ""
 
 
 def test_every_script_is_in_the_registry():

@@ -10,7 +10,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from .campaign import FOLDER
+from .campaign import FOLDER, find_missed
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ NAN = float("nan")
     ],
 )
 def test_a_fault_that_is_late_unsafe_or_not_measured_misses_one_bar(ros_module, change):
-    judge = ros_module("gate_faults").judge
+    set_bars = ros_module("gate_faults").set_bars
     good = {
         "n": 2,
         "asked": 2,
@@ -51,8 +51,9 @@ def test_a_fault_that_is_late_unsafe_or_not_measured_misses_one_bar(ros_module, 
         "limit_s": 0.4,
         "unsafe_commands": 0,
     }
-    assert judge({"x": good}) == []
-    assert len(judge({"x": good | change})) == 1
+    for figures, missed in ((good, 0), (good | change, 1)):
+        result = {"x": figures}
+        assert len(find_missed(result, set_bars(result))) == missed
 
 
 def test_every_rule_of_the_gate_has_a_name_by_which_it_is_taken_out(module):
@@ -133,8 +134,10 @@ def test_engines_are_compared_by_the_episodes_that_all_have_driven(module):
     assert told["fast"]["episodes"] == told["dart"]["episodes"] == 4
     assert told["dart"]["points"] == -25.0
     assert (told["dart"]["lost"], told["dart"]["gained"]) == (1, 0)
-    missed = transfer.judge({"engines": {"rover": told}})
-    assert [line.split(": ")[0] for line in missed] == ["rover in dart"] * 2
+    result = {"engines": {"rover": told}}
+    missed = find_missed(result, transfer.set_bars(result))
+    assert len(missed) == 2
+    assert all(line.startswith("engines: rover: dart: ") for line in missed)
 
 
 def test_failures_are_told_by_place_and_end_the_most_frequent_first(module):
@@ -149,13 +152,19 @@ def test_failures_are_told_by_place_and_end_the_most_frequent_first(module):
 
 def test_a_run_goes_on_where_the_file_ends(module, tmp_path):
     transfer = module("transfer")
+    open_book = module("parts.book").Book
     file = tmp_path / "rows.jsonl"
     asked = {"worlds": ["room"], "randomisation": "mild", "control": None}
-    transfer.Book(file, asked).add([drove("fast", transfer.FIRST_SEED, "success")])
+    seed = transfer.FIRST_SEED
+    first, second = (drove("fast", seed + k, "success") for k in (0, 1))
+    open_book(file, asked).add([second])
     with file.open("a") as torn:
         torn.write('{"robot": "rov')
     given = Namespace(episodes=3, robots=["rover"], **asked)
-    (job,) = transfer.plan_jobs(given, ["fast"], transfer.Book(file, asked))
-    assert job.seeds == [transfer.FIRST_SEED + 1, transfer.FIRST_SEED + 2]
+    book = open_book(file, asked)
+    (job,) = transfer.plan_jobs(given, ["fast"], book)
+    assert job.seeds == [seed, seed + 2]
+    book.add([first])
+    assert open_book(file, asked).rows == [second, first]
     with pytest.raises(SystemExit, match="another run"):
-        transfer.Book(file, asked | {"control": "ice"})
+        open_book(file, asked | {"control": "ice"})

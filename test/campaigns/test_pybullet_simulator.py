@@ -23,7 +23,7 @@ from extras.physics.test_simulators import (  # noqa: F401
     test_a_robot_that_drives_into_a_wall_stops_there_and_has_collided,
     test_a_wrong_command_is_refused,
     test_an_episode_is_the_same_bits_whatever_was_before,
-    test_lidar_faults_are_drawn_as_in_the_fast_simulator,
+    test_faults_of_sensors_are_drawn_as_in_the_fast_simulator,
     test_wheel_odometry_is_wrong_after_a_turn_in_which_the_wheels_skid,
 )
 

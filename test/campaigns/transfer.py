@@ -7,12 +7,13 @@ something. Of two simulators, McNemar's test tells by the episodes that ended we
 alone whether they differ by more than chance. PyBullet has a wheel for Python 3.11 alone:
 `pip install pybullet==3.2.7`; without it, the other engines are compared.
 
-`--out FILE` keeps each episode at once, and the next run goes on where an earlier one ended.
+`--out FILE` keeps the episodes of each engine ten at a time. A run that was interrupted or killed
+goes on from there by the same command, and ends with the same figures.
 """
 
 from __future__ import annotations
 
-import json
+import signal
 from collections import defaultdict
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -25,17 +26,19 @@ from pathlib import Path
 from typing import Any
 
 from campaign import (
+    Bar,
+    Bars,
     Given,
     Result,
     at_least,
     at_most,
-    missed_bars,
     run_campaign,
     some_of,
     tell,
 )
 from measuring.evaluations import Standing
 from measuring.perturbations import open_real_model
+from parts.book import Book, Row
 from scipy import stats
 
 from nics_drl_bridge.commands.episodes import Conditions, make_env
@@ -74,9 +77,8 @@ BLOCK = 10  # episodes that one process drives before it tells
 AT_ONCE = 2
 ICE = 0.02  # friction of tyres on ice
 FAST_SUCCESS = at_least(0.95, "success in the fast simulator")
-APART = at_most(3.0, "points of success apart from the fast simulator")
+APART = Bar(-3.0, 3.0, "points of success apart from the fast simulator")
 COLLISIONS = at_most(0.01, "collisions")
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -149,34 +151,15 @@ def drive_job(job: Job) -> list[Row]:
     return rows
 
 
-class Book:
-    """The rows of a run, in a file if there is one, whose first line says what was asked for."""
-
-    def __init__(self, file: Path | None, asked: Row) -> None:
-        self.file = file
-        self.asked = asked
-        self.rows: list[Row] = []
-        if file is None:
-            return
-        if not file.exists():
-            file.write_text(json.dumps(asked) + "\n")
-        first, *rows = file.read_text().splitlines()
-        if json.loads(first) != asked:
-            raise SystemExit(f"{file}: is of another run, {first}; name another file.")
-        self.rows = [json.loads(row) for row in rows if row.endswith("}")]
-
-    def add(self, rows: Sequence[Row]) -> None:
-        """Keeps rows."""
-        self.rows += rows
-        if self.file is not None:
-            with self.file.open("a") as file:
-                file.write("".join(json.dumps(row) + "\n" for row in rows))
+def key_of(row: Row) -> tuple[str, str, int]:
+    """Returns what an episode is known by."""
+    return row["robot"], row["engine"], row["seed"]
 
 
 def plan_jobs(given: Given, engines: Sequence[str], book: Book) -> list[Job]:
     """Returns what is still to be driven, all engines of a block of seeds before the next."""
     end = FIRST_SEED + given.episodes
-    driven = {(row["robot"], row["engine"], row["seed"]) for row in book.rows}
+    driven = set(map(key_of, book.rows))
     jobs = []
     for first in range(FIRST_SEED, end, BLOCK):
         block = range(first, min(first + BLOCK, end))
@@ -198,7 +181,10 @@ def find_engines(asked: Sequence[str]) -> tuple[list[str], dict[str, str]]:
 
 def drive_jobs(jobs: Sequence[Job], book: Book) -> None:
     """Drives jobs in processes of their own, and keeps their rows."""
-    with ProcessPoolExecutor(AT_ONCE, mp_context=get_context("spawn")) as pool:
+    # Ctrl-C reaches the workers, too: by default, each would go on with the next job.
+    stops = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_DFL)}
+    spawn = get_context("spawn")
+    with ProcessPoolExecutor(AT_ONCE, mp_context=spawn, **stops) as pool:
         pending = {pool.submit(drive_job, job): job for job in jobs}
         for count, done in enumerate(as_completed(pending), 1):
             job = pending[done]
@@ -214,17 +200,21 @@ def measure(given: Given) -> Result:
     engines, left_out = find_engines(given.engines)
     asked = ("worlds", "randomisation", "control")
     book = Book(given.out, {name: getattr(given, name) for name in asked})
-    drive_jobs(plan_jobs(given, engines, book), book)
+    try:
+        drive_jobs(plan_jobs(given, engines, book), book)
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted; with --out, the same command goes on") from None
+    rows = sorted(book.rows, key=key_of)  # whichever was driven first
     return {
-        "clusters": find_clusters(book.rows),
+        "clusters": find_clusters(rows),
         "left_out": left_out,
-        "engines": compare_engines(book.rows, given.robots, engines),
+        "engines": compare_engines(rows, given.robots, engines),
     }
 
 
 def find_clusters(rows: Sequence[Row]) -> list[Row]:
     """Returns the failures by robot, engine, world and end, the largest cluster first."""
-    ended = {(row["robot"], row["engine"], row["seed"]): row["result"] for row in rows}
+    ended = {key_of(row): row["result"] for row in rows}
     failed = [
         ((row["robot"], row["engine"], row["world"], row["result"]), row["seed"])
         for row in rows
@@ -282,19 +272,16 @@ def compare_pairs(first: Sequence[bool], second: Sequence[bool]) -> dict[str, fl
     return {"points": points, "lost": lost, "gained": gained, "p": float(p)}
 
 
-def judge(result: Result) -> list[str]:
-    missed = []
+def set_bars(result: Result) -> Bars:
+    bars: dict[str, Any] = {robot: {} for robot in result["engines"]}
     for robot, engines in result["engines"].items():
         for engine, told in engines.items():
-            figures = {name: told[name]["value"] for name in ("collision", "success")}
-            bars = {"collision": COLLISIONS}
+            own = bars[robot][engine] = {"collision": {"value": COLLISIONS}}
             if engine == FAST:
-                bars["success"] = FAST_SUCCESS
+                own["success"] = {"value": FAST_SUCCESS}
             elif "points" in told:
-                figures["points"] = abs(told["points"])
-                bars["points"] = APART
-            missed += missed_bars(figures, bars, f"{robot} in {engine}: ")
-    return missed
+                own["points"] = APART
+    return {"engines": bars}
 
 
 def split_engines(words: str) -> list[str]:
@@ -320,4 +307,4 @@ OPTIONS = {
 }
 
 if __name__ == "__main__":
-    run_campaign(measure, judge, OPTIONS)
+    run_campaign(measure, set_bars, OPTIONS)

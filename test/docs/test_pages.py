@@ -38,6 +38,8 @@ DOTTED = re.compile(
 )
 OPTIONAL = {"rclpy", "mujoco", "torch", "stable_baselines3", "pettingzoo", "onnx"}
 PLACEHOLDERS = {"...", "NAME"}
+SOURCES = ("world.py", "state.py", "obstacle_kernels.py")
+"""Where a motion of obstacles is added."""
 
 
 def text_of(page: Path) -> str:
@@ -152,6 +154,16 @@ def test_every_world_and_set_that_is_listed_stands_in_the_table_of_worlds():
     table = page.partition("## The shipped ones")[2].partition("\n## ")[0]
     rows = re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)
     assert sorted(rows) == sorted(row["name"] for row in worlds())
+
+
+def test_the_steps_to_a_motion_of_obstacles_name_what_the_files_hold():
+    page = text_of(ROOT / "docs" / "extensions.md")
+    (steps,) = re.findall(r"^## A motion of obstacles\n(.*?)^## ", page, re.M | re.S)
+    files = [ROOT / "nics_drl_bridge" / "sim" / name for name in SOURCES]
+    source = "".join(map(text_of, files))
+    named = set(re.findall(r"`([A-Za-z_]{5,})[`(]", steps)) - {"orbit", "ORBIT"}
+    assert {"plan_arrays", "ObstaclePlan", "reset_marks", "_share"} <= named
+    assert [name for name in named if name not in source] == []
 
 
 def test_what_a_page_shows_is_found_and_what_there_is_not_is_noticed():
