@@ -1,5 +1,6 @@
 """`nics warmup`: compiles kernels in advance; all of them on two cores."""
 
+import gc
 import os
 import signal
 import time
@@ -36,7 +37,9 @@ def warmup(
 ) -> None:
     """Compiles the simulator in advance, once per machine."""
     begin = time.monotonic()
-    if for_wheel:  # numba reads these at its import
+    # numba reads these at its import. It makes an error message for each type that it tries.
+    os.environ["NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING"] = "1"
+    if for_wheel:
         os.environ |= {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""}
     typer.echo("compiling the kernels: a minute or two, once on this machine", err=True)
     parts = [_simulate, _drive] if all_kernels or for_wheel else [_simulate]
@@ -64,6 +67,7 @@ def _compile(parts: Sequence[Callable[..., Any]], for_wheel: bool) -> tuple[int,
 def _begin(for_wheel: bool) -> None:
     """Leaves Ctrl-C to the parent; for a wheel, compiles into the package's folder."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.disable()  # Collecting takes seconds, and the process soon ends.
     if for_wheel:
         from nics_drl_bridge.kernels import compile_for_wheel
 
