@@ -100,7 +100,7 @@ fi
 @PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install -qq -c $(VENV)/constraints.txt uv
 @$(UV_INSTALL) setuptools
 @$(UV_INSTALL) --no-build-isolation --editable .
-@# The kernels are compiled while the larger libraries arrive; for the demo, also those that drive.
+@# The kernels are compiled while the larger libraries arrive; for the demo, all that it needs.
 @$(BIN)/nics warmup $(3) & compiling=$$!; \
 	$(UV_INSTALL) $(TORCH) --no-build-isolation --editable '.[$(2)]' \
 		|| $(if $(TORCH),$(UV_INSTALL) --no-build-isolation --editable '.[$(2)]',exit 1); \
@@ -119,7 +119,7 @@ $(READY): $(DESCRIBED_BY)
 	$(call BUILD,$@,$(EXTRAS))
 
 $(READY_FOR_DEMO): $(DESCRIBED_BY)
-	$(call BUILD,$@,$(DEMO_EXTRAS),--all)
+	$(call BUILD,$@,$(DEMO_EXTRAS),--for-demo)
 
 demo: $(or $(wildcard $(READY)),$(READY_FOR_DEMO)) ## run the whole chain on a recording: make demo [RECORDING=folder]
 	$(BIN)/nics demo $(if $(RECORDING),--recording "$(RECORDING)") --out runs/demo

@@ -14,11 +14,20 @@ from nics_drl_bridge.commands.console import JsonOption, show_progress
 from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
+WORKERS = 2  # processes that compile at once; each needs a gigabyte
 AllOption = Annotated[
     bool,
     typer.Option(
         "--all",
         help="Compile those of the planners, the gate and the estimator too, as a robot needs.",
+    ),
+]
+DemoOption = Annotated[
+    bool,
+    typer.Option(
+        "--for-demo",
+        help="Compile what nics demo needs: also training, estimator and gate.",
+        hidden=True,
     ),
 ]
 WheelOption = Annotated[
@@ -32,6 +41,7 @@ WheelOption = Annotated[
 
 def warmup(
     all_kernels: AllOption = False,
+    for_demo: DemoOption = False,
     for_wheel: WheelOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -42,7 +52,11 @@ def warmup(
     if for_wheel:
         os.environ |= {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""}
     typer.echo("compiling the kernels: a minute or two, once on this machine", err=True)
-    parts = [_simulate, _drive] if all_kernels or for_wheel else [_simulate]
+    parts: list[Callable[..., Any]] = [_simulate]
+    if for_demo:
+        parts += [_estimate, _learn, _guard]
+    if all_kernels or for_wheel:
+        parts += [_estimate, _learn, _guard, _plan]
     with show_progress("compiling"):
         count, cpu_s = _compile(parts, for_wheel)
     took = time.monotonic() - begin
@@ -57,7 +71,8 @@ def warmup(
 def _compile(parts: Sequence[Callable[..., Any]], for_wheel: bool) -> tuple[int, float]:
     """Compiles parts at once; returns the number of kernels, and their CPU time [s]."""
     # Spawned, not forked: a fork could inherit a lock that is never released.
-    with get_context("spawn").Pool(len(parts), _begin, (for_wheel,)) as pool:
+    workers = min(len(parts), WORKERS)
+    with get_context("spawn").Pool(workers, _begin, (for_wheel,)) as pool:
         *first, model = pool.apply(_compile_by, (_model,))
         jobs = [pool.apply_async(_compile_by, (part, model)) for part in parts]
         counts, cpu_s = zip(first, *(job.get()[:2] for job in jobs), strict=True)
@@ -67,7 +82,6 @@ def _compile(parts: Sequence[Callable[..., Any]], for_wheel: bool) -> tuple[int,
 def _begin(for_wheel: bool) -> None:
     """Leaves Ctrl-C to the parent; for a wheel, compiles into the package's folder."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    gc.disable()  # Collecting takes seconds, and the process soon ends.
     if for_wheel:
         from nics_drl_bridge.kernels import compile_for_wheel
 
@@ -77,6 +91,7 @@ def _begin(for_wheel: bool) -> None:
 def _compile_by(part: Callable[..., Any], *given: Any) -> tuple[int, float, Any]:
     from nics_drl_bridge.kernels import COMPILING
 
+    gc.disable()  # collecting takes seconds, and the process soon ends
     COMPILING.quiet = True
     count = COMPILING.count
     cpu_s = COMPILING.cpu_s
@@ -103,14 +118,30 @@ def _simulate(model: Any) -> None:
         env.close()
 
 
-def _drive(model: Any) -> None:
+def _estimate(model: Any) -> None:
+    from nics_drl_bridge.middleware.middleware import rehearse
+
+    rehearse(model)
+
+
+def _learn(_: Any) -> None:
+    from nics_drl_bridge.policy.train import learner
+
+    learner.warm_up()
+
+
+def _guard(_: Any) -> None:
+    from nics_drl_bridge.gate import shield
+
+    shield.warm_up()
+
+
+def _plan(model: Any) -> None:
     import numpy as np
 
-    from nics_drl_bridge.gate import shield
     from nics_drl_bridge.middleware.middleware import rehearse
     from nics_drl_bridge.policy.policies import open_policy
 
     for name in ("dynamic_window", "mppi"):
         policy, task = open_policy(name, model)
         policy.act(task.observation(rehearse(model), {"goal": np.ones(2)}))
-    shield.warm_up()

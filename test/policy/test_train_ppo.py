@@ -7,9 +7,11 @@ import pytest
 from robots import direct_model, field
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.policy.train import ppo as train_ppo
+from nics_drl_bridge.policy.train import learner as train_learner
+from nics_drl_bridge.policy.train.kernels import Transitions
+from nics_drl_bridge.policy.train.learner import estimate_advantages
 from nics_drl_bridge.policy.train.networks import Network
-from nics_drl_bridge.policy.train.ppo import LeanPpo, Transitions, estimate_advantages
+from nics_drl_bridge.policy.train.ppo import LeanPpo
 from nics_drl_bridge.policy.train.settings import TrainingSettings
 from nics_drl_bridge.policy.train.worlds import TrainingWorlds
 
@@ -192,9 +194,9 @@ def test_actor_and_critic_learn_at_once_while_a_core_is_free_to_the_same_bits(
     wanted = gradients.copy()
     gradients[:] = 0.0
     jobs = []
-    together = train_ppo.run_parts
+    together = train_learner.run_parts
     monkeypatch.setattr(
-        train_ppo,
+        train_learner,
         "run_parts",
         lambda job, parts: jobs.append(len(parts)) or together(job, parts),
     )
