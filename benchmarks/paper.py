@@ -117,9 +117,9 @@ def drive(robot: Subject, seed: int) -> Samples:
     return Samples(t=t, q=np.zeros((STEPS, 3)), x=x, dq=geometry.log(moved) / DT, dt=DT)
 
 
-def find_errors(model: TaylorModel, robot: Subject) -> Array:
+def find_errors(model: TaylorModel, robot: Subject, seed: int) -> Array:
     """Returns the RMSE (3,) per step of another drive, in the body frame."""
-    x = drive(robot, 2).x
+    x = drive(robot, seed).x
     truth = robot.twist(x) * DT
     guess = model.rates(x) * DT
     apart = geometry.exp(guess)[:, :2] - geometry.exp(truth)[:, :2]
@@ -147,7 +147,7 @@ def measure_robot(name: str, control: str | None) -> Result:
         digits = [float(f"{each:.2g}") for each in model.coefficients.ravel()]
         rounded = np.reshape(digits, model.coefficients.shape)
         model = replace(model, coefficients=rounded)
-    step = find_errors(model, robot)
+    step = find_errors(model, robot, seed=2)
     speeds = measure_speeds(model, robot.spec, {})
     return {
         **dict(zip(ERRORS, step.tolist(), strict=True)),

@@ -28,17 +28,17 @@ from nics_drl_bridge.robot.spec import load_robot
 
 
 @pytest.fixture
-def without_torch(monkeypatch):
+def without_tensorboard(monkeypatch):
     monkeypatch.setattr(
         extensions,
         "find_spec",
-        lambda name: None if name == "torch" else find_spec(name),
+        lambda name: None if name == "tensorboard" else find_spec(name),
     )
 
 
 @pytest.mark.slow
 def test_without_the_extra_the_shipped_policy_of_the_robot_drives(
-    tmp_path, without_torch
+    tmp_path, without_tensorboard
 ):
     robot = "differential"
     pytest.importorskip("onnxruntime")
@@ -47,7 +47,7 @@ def test_without_the_extra_the_shipped_policy_of_the_robot_drives(
     assert learned.policy == robot
     assert learned.curve == ()
     (sentence,) = said
-    assert "needs the module 'torch'" in sentence
+    assert "needs the module 'tensorboard'" in sentence
     assert f"driving with the policy {robot!r} instead" in sentence
     assert list(tmp_path.iterdir()) == []
 

@@ -162,7 +162,7 @@ def test_the_steps_to_a_motion_of_obstacles_name_what_the_files_hold():
     files = [ROOT / "nics_drl_bridge" / "sim" / name for name in SOURCES]
     source = "".join(map(text_of, files))
     named = set(re.findall(r"`([A-Za-z_]{5,})[`(]", steps)) - {"orbit", "ORBIT"}
-    assert {"plan_arrays", "ObstaclePlan", "reset_marks", "_share"} <= named
+    assert {"plan_arrays", "ObstaclePlan", "reset_marks"} <= named
     assert [name for name in named if name not in source] == []
 
 
