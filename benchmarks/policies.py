@@ -662,7 +662,7 @@ BENCHMARKS = {
             "episodes": 500,
         },
         short=None,
-        needs=("torch",),
+        needs=("tensorboard",),
     ),
     "baselines": Benchmark(
         measure_baselines,

@@ -52,6 +52,7 @@ INSTALL = {
     "websockets": "view",
 }
 TRAINING = ("filelock", "tensorboard", "onnx", "onnxruntime")
+SB3 = ("torch", "stable_baselines3")
 
 
 @cache

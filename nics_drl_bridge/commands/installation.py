@@ -11,6 +11,7 @@ from typing import NamedTuple
 from nics_drl_bridge.extensions import (
     INSTALL_ROS,
     PACKAGE,
+    SB3,
     TRAINING,
     find_lacking,
 )
@@ -20,7 +21,7 @@ EXTRAS = {  # extra -> purpose, modules that it installs
     "bags": ("reading and writing rosbags", ("rosbags", "mcap")),
     "deploy": ("driving by policy files", ("onnx", "onnxruntime")),
     "train": ("training", TRAINING),
-    "sb3": ("training with Stable-Baselines3", ("torch", "stable_baselines3")),
+    "sb3": ("training with Stable-Baselines3", SB3),
     "multi": ("teams, as PettingZoo environments", ("pettingzoo",)),
     "view": ("the page of nics watch", ("websockets",)),
     "video": ("MP4 files of nics watch", ("imageio_ffmpeg",)),

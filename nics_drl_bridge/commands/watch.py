@@ -10,6 +10,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
+from nics_drl_bridge.commands.interrupts import has_heard_ctrl_c
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
@@ -160,4 +161,7 @@ def _serve(source: Any, port: int, browser: bool) -> None:
 
     with closing(PageServer(port)) as server:
         open_page(server.url, browser)
-        show(source, server)
+        # Compiled code now and then swallows the KeyboardInterrupt of a Ctrl-C.
+        show(source, server, has_heard_ctrl_c)
+    if has_heard_ctrl_c():
+        raise KeyboardInterrupt

@@ -94,8 +94,8 @@ def check_listed(request: Request, stage: Stage) -> None:
             )
 
 
-def show(source: FrameSource, server: PageServer) -> None:
-    """Shows a source until the server is closed."""
+def show(source: FrameSource, server: PageServer, is_over: Callable[[], bool]) -> None:
+    """Shows a source until the server is closed, or `is_over` says so before a frame."""
     pace = Tempo()
     shown_s = 0.0
 
@@ -113,7 +113,7 @@ def show(source: FrameSource, server: PageServer) -> None:
 
     server.set_stage(source.stage())
     publish()
-    while pace.wait(server, source.period_s, handle):
+    while not is_over() and pace.wait(server, source.period_s, handle):
         try:
             if source.advance():
                 server.set_stage(source.stage())

@@ -95,7 +95,7 @@ def test_every_run_has_arguments_that_its_benchmark_knows():
 @pytest.mark.process
 @pytest.mark.timeout(700)
 def test_each_fold_learns_anew_and_is_judged_in_worlds_that_it_did_not_see(tmp_path):
-    pytest.importorskip("torch", reason="needs the extra train")
+    pytest.importorskip("tensorboard", reason="needs the extra train")
     from nics_drl_bridge.config import dump_yaml
     from nics_drl_bridge.policy.train.settings import load_training
 

@@ -69,6 +69,17 @@ def test_the_command_shows_a_policy_driving_until_ctrl_c(tmp_path):
         assert process.wait(30.0) == 130
 
 
+def test_a_ctrl_c_that_compiled_code_swallowed_ends_it_all_the_same(monkeypatch):
+    heard = []
+    monkeypatch.setattr(module, "has_heard_ctrl_c", lambda: bool(heard))
+    world = source()
+    advance = world.advance
+    monkeypatch.setattr(world, "advance", lambda: heard.append(True) or advance())
+    with closing(world), pytest.raises(KeyboardInterrupt):
+        module._serve(world, 0, False)
+    assert len(heard) == 1
+
+
 def test_a_watched_training_shows_each_env_and_what_it_does(monkeypatch):
     views = []
 
@@ -93,7 +104,7 @@ def test_a_watched_training_shows_each_env_and_what_it_does(monkeypatch):
 @pytest.mark.campaign
 @pytest.mark.process
 def test_a_training_shows_its_worlds(tmp_path):
-    pytest.importorskip("torch", reason="needs the extra train")
+    pytest.importorskip("tensorboard", reason="needs the extra train")
     words = ("train", "--world", "circles", "--steps", "200000", "--watch")
     with serving(*words, cwd=tmp_path) as (process, client):
         frame = client.next("frame", lambda frame: frame.get("worlds"))

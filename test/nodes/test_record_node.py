@@ -229,6 +229,8 @@ def test_ctrl_c_on_the_command_line_saves_a_bag_and_tells_what_it_holds(
         )
         try:
             robot.until(lambda: robot.driven, "it drives")
+            begin = time.monotonic()
+            robot.until(lambda: time.monotonic() - begin > 2.0, "it drives on")
             command.send_signal(signal.SIGINT)
             robot.until(lambda: command.poll() is not None, "it ends")
         finally:

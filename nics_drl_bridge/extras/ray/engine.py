@@ -47,7 +47,7 @@ from nics_drl_bridge.policy.train.worlds import COLLISION as TOLD_COLLISION
 from nics_drl_bridge.policy.train.worlds import SUCCESS as TOLD_SUCCESS
 from nics_drl_bridge.policy.train.worlds import TrainingWorlds
 
-FORMAT = "nics_drl_bridge/ray_checkpoint/1"
+FORMAT = "nics_drl_bridge/ray_checkpoint/2"
 # loss parameters, as in Stable-Baselines3
 VALUE_WEIGHT = 0.5
 GRADIENT_LIMIT = 0.5

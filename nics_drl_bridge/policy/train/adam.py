@@ -1,7 +1,4 @@
-"""Adam (Kingma and Ba 2015) for one vector of weights.
-
-torch's optimisers import its compiler, which takes longer than a short training.
-"""
+"""Adam (Kingma and Ba 2015) for one vector of weights."""
 
 import numpy as np
 

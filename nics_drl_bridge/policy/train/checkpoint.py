@@ -16,6 +16,7 @@ from nics_drl_bridge.lidar.arrays import AnyArray
 from nics_drl_bridge.policy.train.worlds import TrainingWorlds
 
 FORMAT = "nics_drl_bridge/checkpoint/6"
+MOST_TEXT = 2**24
 MOST_BYTES = 4 * 2**30  # maximum size of a file, which includes SAC's whole buffer
 CONTENT = "content"  # name of the array that holds everything else as JSON text
 ARRAY = "array"
@@ -58,13 +59,14 @@ def _take_out_arrays(content: Any, arrays: dict[str, AnyArray]) -> Any:
     return {ARRAY: name}
 
 
-def _put_back_arrays(content: Any, arrays: Mapping[str, AnyArray]) -> Any:
+def _put_back_arrays(content: Any, arrays: dict[str, AnyArray]) -> Any:
+    """Reverses `_take_out_arrays`; each array belongs to one place only."""
     if isinstance(content, list):
         return [_put_back_arrays(part, arrays) for part in content]
     if not isinstance(content, dict):
         return content
     if ARRAY in content:
-        return arrays[content[ARRAY]]
+        return arrays.pop(content[ARRAY])
     return {key: _put_back_arrays(value, arrays) for key, value in content[ITEMS]}
 
 
@@ -84,10 +86,15 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
                 if any(member.compress_type for member in archive.infolist()):
                     raise ValueError("numpy compresses only on request")
             file.seek(0)
-            with np.load(file, allow_pickle=False) as arrays:
-                content = json.loads(arrays[CONTENT].tobytes())
-                read = _put_back_arrays(content, arrays)
+            with np.load(file, allow_pickle=False) as stored:
+                arrays = dict(stored)
+            text = arrays.pop(CONTENT)
+            if text.nbytes > MOST_TEXT:
+                raise ValueError("its text is longer than that of any checkpoint")
+            read = dict(_put_back_arrays(json.loads(text.tobytes()), arrays))
         format_name = str(read["format"])
+        if not isinstance(read["about"], dict):
+            raise ValueError("it does not say which training it belongs to")
     except Exception:  # noqa: BLE001 - a damaged file breaks numpy in any way
         raise ConfigError(
             f"{path}: is not a training checkpoint, or is damaged; leave out "
@@ -98,7 +105,7 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
             f"{path}: is a {format_name!r}, not a {kind!r}; resume with the same --engine "
             "and version."
         )
-    return dict(read)
+    return read
 
 
 Arrays = dict[str, AnyArray]

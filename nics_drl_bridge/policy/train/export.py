@@ -86,6 +86,10 @@ def _make_raw_network(
     model: Any, task: Task, normaliser: Normaliser | None
 ) -> RawNetwork:
     if isinstance(model, Actor):
+        if normaliser is not None:
+            raise ConfigError(
+                "the actor of a training has a normaliser of its own; leave `normaliser` out."
+            )
         return network_graph.make_raw_network(model)
     with extensions.require_modules("the export of a network of PyTorch"):
         from nics_drl_bridge.policy.train import torch_export

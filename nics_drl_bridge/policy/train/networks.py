@@ -122,6 +122,8 @@ class ActorCritic:
 
     def draw(self, raw: Singles, rng: np.random.Generator) -> AnyArray:
         """Draws actions (n, C), or indices (n,), given the outputs (n, C) of the actor."""
+        if not np.isfinite(raw).all():
+            raise ValueError("the actor's outputs are not finite")
         if self.is_discrete:
             # the maximum of logits with Gumbel noise has their probabilities
             chosen: AnyArray = (raw + rng.gumbel(size=raw.shape)).argmax(axis=1)

@@ -124,6 +124,7 @@ class LeanPpo:
         self.networks = networks
         see = Normaliser.of(worlds.observation_space, *normaliser)
         self.algorithm = Actor(see, networks.actor, networks.is_discrete)
+        self.act = self.algorithm.act
         self.collector = Collector(worlds, networks, see, self._ppo.rollout, collecting)
         self.learner = Learner(networks, self._ppo, learning)
         self.steps = 0  # number of steps learnt from, over all worlds
@@ -134,10 +135,6 @@ class LeanPpo:
     def greatest_weight(self) -> float:
         """Largest magnitude of a weight; NaN if one is not a number."""
         return float(np.abs(self.networks.weights).max())
-
-    def act(self, observations: Singles) -> AnyArray:
-        """Returns the most likely actions for observations."""
-        return self.algorithm.act(observations)
 
     @one_blas_thread
     def learn(self, watch: Watch, log: TrainingLog) -> None:
@@ -150,6 +147,7 @@ class LeanPpo:
             watch.keep(self.steps)
             if watch.ends(self.steps, self.act, log):
                 watch.report(self.steps, self._successes, log)
+                log.dump(self.steps)
                 return
             loss = self._advance(self._rollout, watch)
             if watch.report(self.steps, self._successes, log):
@@ -211,19 +209,26 @@ class LeanPpo:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continues from the state of another training made with the same arguments."""
-        self.networks.weights[:] = state["weights"]
+        _restore_array(self.networks.weights, state["weights"])
         optimiser = self.learner.optimiser
         optimiser.steps = state["optimiser"]["steps"]
-        optimiser.mean[:] = state["optimiser"]["mean"]
-        optimiser.square[:] = state["optimiser"]["square"]
+        _restore_array(optimiser.mean, state["optimiser"]["mean"])
+        _restore_array(optimiser.square, state["optimiser"]["square"])
         normaliser = self.algorithm.normaliser
-        normaliser.mean[:] = state["normaliser"]["mean"]
-        normaliser.std[:] = state["normaliser"]["std"]
+        _restore_array(normaliser.mean, state["normaliser"]["mean"])
+        _restore_array(normaliser.std, state["normaliser"]["std"])
         self.steps = state["steps"]
         rollout = state["rollout"]
         self._rollout = rollout and Rollout(**rollout)
         self._successes.extend(state["recent"])
-        self.collector.last = state["last"]
+        _restore_array(self.collector.last, state["last"])
         collecting, learning = state["random"]
         self.collector.rng.bit_generator.state = collecting
         self.learner.rng.bit_generator.state = learning
+
+
+def _restore_array(target: AnyArray, saved: AnyArray) -> None:
+    """Copies a saved array. Raises ValueError unless it has the target's type and shape."""
+    if saved.dtype != target.dtype or saved.shape != target.shape:
+        raise ValueError(f"an array is {saved.dtype} of shape {saved.shape}")
+    target[:] = saved

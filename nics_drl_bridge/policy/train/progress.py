@@ -74,9 +74,10 @@ class TrainingLog:
         self._writer.add_event(
             Event(step=steps, wall_time=time.time(), summary=summary)
         )
+        self._writer.flush()
 
     def close(self) -> None:
-        """Writes what is left, and closes the file."""
+        """Closes the file; drops figures that were not dumped."""
         self._writer.close()
 
 

@@ -46,6 +46,7 @@ from nics_drl_bridge.policy.train.stop import Stop
 from nics_drl_bridge.policy.train.worlds import TrainingWorlds
 from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim.world_set import AnyWorld
+from nics_drl_bridge.threads import one_blas_thread
 
 CHECKPOINT = "checkpoint.npz"
 SETTINGS = "settings.yaml"
@@ -122,8 +123,9 @@ def train(
         except (RuntimeError, ValueError, gymnasium.error.InvalidAction):
             refuse_diverged(training, MOST_WEIGHT)
             raise
+        finally:
+            log.close()
         save()
-        log.close()
     return Trained(
         training.algorithm,
         training.act,
@@ -204,6 +206,7 @@ def _restore(
     except (
         AttributeError,
         IndexError,
+        OverflowError,
         KeyError,
         RuntimeError,
         TypeError,
@@ -238,6 +241,7 @@ def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
         )
 
 
+@one_blas_thread
 def evaluate(
     act: Act,
     model: SimulatorModel,
@@ -333,6 +337,8 @@ def run(
     """
     _check(order.settings, order.seeds, order.out, order.resumed)
     settings = order.settings
+    if not settings.lean:
+        extensions.require("Stable-Baselines3's engine", *extensions.SB3)
     model, worlds = opened or open_training(settings)
     _try_task(model, worlds, settings)
     results = []

@@ -196,7 +196,8 @@ class LogWriter(KVWriter):
     ) -> None:
         """Records all numbers, and writes them."""
         for name, value in key_values.items():
-            if isinstance(value, int | float | np.number):
+            is_for_others = "tensorboard" in (key_excluded.get(name) or ())
+            if isinstance(value, int | float | np.number) and not is_for_others:
                 self._log.record(name, float(value))
         self._log.dump(step)
 

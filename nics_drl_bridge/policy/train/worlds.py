@@ -24,7 +24,7 @@ class Endings(NamedTuple):
 
     worlds: Integers  # (K,) their worlds
     truncated: Mask  # (K,) those that only the time limit ended
-    # (K,) success and collision, as far as the task tells them
+    # (K,) success and collision, if the task reports them
     flags: dict[str, Mask]
     observations: Singles  # (K, O) their last observations
 
@@ -36,7 +36,7 @@ class Endings(NamedTuple):
 class Step(NamedTuple):
     """A step of all N worlds."""
 
-    # (N, O) after the end of an episode, the first of the next one
+    # (N, O) current observations; where an episode ended, the first of the next one
     observations: Singles
     rewards: Singles  # (N,)
     ended: Mask  # (N,)
@@ -75,6 +75,11 @@ class TrainingWorlds:
         # called after each step of all worlds
         self.on_step: Callable[[], None] | None = None
         self._seeds: Sequence[int] | None = None
+
+    @property
+    def unwrapped(self) -> TrainingWorlds:
+        """Returns itself, for learners that look behind wrappers."""
+        return self
 
     def seed(self, seed: int) -> None:
         """Sets the seeds of the next `reset`: `seed` plus the index of the world."""
