@@ -94,7 +94,11 @@ def check_listed(request: Request, stage: Stage) -> None:
             )
 
 
-def show(source: FrameSource, server: PageServer, is_over: Callable[[], bool]) -> None:
+def show(
+    source: FrameSource,
+    server: PageServer,
+    is_over: Callable[[], bool] = lambda: False,
+) -> None:
     """Shows a source until the server is closed, or `is_over` says so before a frame."""
     pace = Tempo()
     shown_s = 0.0
