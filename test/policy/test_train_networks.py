@@ -16,9 +16,11 @@ def make_networks(is_discrete):
 def test_a_network_is_its_layers_with_relu_in_between():
     actor = make_networks(False).actor
     rows = np.random.default_rng(1).normal(size=(6, 4)).astype(np.float32)
-    (one, a), (two, b), (three, c) = actor.layers
-    hidden = np.maximum(np.maximum(rows @ one.T + a, 0.0) @ two.T + b, 0.0)
-    assert actor(rows) == pytest.approx(hidden @ three.T + c, abs=1e-6)
+    first, second, last = actor.layers
+    expected = np.maximum(rows @ first.matrix.T + first.bias, 0.0)
+    expected = np.maximum(expected @ second.matrix.T + second.bias, 0.0)
+    expected = expected @ last.matrix.T + last.bias
+    assert actor(rows) == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_copy_has_weights_of_its_own():
@@ -36,8 +38,11 @@ def test_a_copy_has_weights_of_its_own():
 def test_drawn_matrices_are_orthogonal(shape):
     drawn = draw_orthogonal(shape, np.random.default_rng(2))
     assert drawn.shape == shape
-    small = drawn @ drawn.T if shape[0] < shape[1] else drawn.T @ drawn
-    assert small == pytest.approx(np.eye(min(shape)), abs=1e-12)
+    if shape[0] < shape[1]:
+        products = drawn @ drawn.T
+    else:
+        products = drawn.T @ drawn
+    assert products == pytest.approx(np.eye(min(shape)), abs=1e-12)
 
 
 def test_discrete_actions_are_drawn_with_the_probabilities_that_are_told():
@@ -60,5 +65,7 @@ def test_continuous_actions_have_the_deviation_and_the_density_that_are_told():
     at_mean = networks.compute_log_probs(raw[:1], raw[:1])[0]
     # log(2 pi)^(-3/2), as the deviations multiply to one
     assert at_mean == pytest.approx(-1.5 * np.log(2.0 * np.pi), abs=1e-5)
-    off = networks.compute_log_probs(raw[:1], raw[:1] + networks.log_std * 0 + 1.0)[0]
-    assert at_mean - off == pytest.approx(0.5 * (4.0 + 1.0 + 0.25), abs=1e-5)
+    shifted = raw[:1] + np.float32(1.0)
+    beside = networks.compute_log_probs(raw[:1], shifted)[0]
+    squares = 4.0 + 1.0 + 0.25  # of the deviations that 1 is from the mean
+    assert at_mean - beside == pytest.approx(0.5 * squares, abs=1e-5)

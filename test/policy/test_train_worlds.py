@@ -45,4 +45,4 @@ def test_endings_of_all_envs_are_told_with_the_worlds_numbers():
         step.ended.sum(),
         step.observations.shape[1],
     )
-    assert not step.endings.told("is_success").any()
+    assert not step.endings.get_flag("is_success").any()

@@ -161,7 +161,7 @@ class WorldsRunner(SingleAgentEnvRunner):
         self._last = step.observations
         endings = step.endings
         for name, metric in ((TOLD_SUCCESS, SUCCESS), (TOLD_COLLISION, COLLISION)):
-            count = int(endings.told(name).sum())
+            count = int(endings.get_flag(name).sum())
             self.metrics.log_value(metric, count, reduce="sum")
         final = {
             (t, int(n)): (endings.observations[k], bool(endings.truncated[k]))

@@ -99,7 +99,7 @@ class Learner:
         )
 
     def learn(self, transitions: Transitions, rate: float) -> float:
-        """Learns from a rollout at a learning rate; returns the loss of the last batch."""
+        """Steps the weights along the gradients of batches; returns the last batch's loss."""
         count = len(transitions.observations)
         for _ in range(self.ppo.epochs):
             order = self.rng.permutation(count)

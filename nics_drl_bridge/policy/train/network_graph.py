@@ -75,12 +75,12 @@ def make_raw_network(actor: Actor) -> RawNetwork:
     opset = helper.make_opsetid("", OPSET)
     model = helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION)
     build = GraphBuilder(model).add
-    see = actor.normaliser
-    factors, offsets = compute_bend(see.shares)
+    normaliser = actor.normaliser
+    factors, offsets = compute_bend(normaliser.shares)
     above = build("Mul", onnx_graph.INPUT, factors)
-    below = build("Add", build("Mul", onnx_graph.INPUT, see.shares), offsets)
-    shifted = build("Sub", build("Div", above, below), see.mean)
-    rows = build("Clip", build("Div", shifted, see.std), -LIMIT, LIMIT)
+    below = build("Add", build("Mul", onnx_graph.INPUT, normaliser.shares), offsets)
+    shifted = build("Sub", build("Div", above, below), normaliser.mean)
+    rows = build("Clip", build("Div", shifted, normaliser.std), -LIMIT, LIMIT)
     *hidden, last = actor.network.layers
     for layer in hidden:
         rows = build("Relu", build("Gemm", rows, layer.matrix, layer.bias, transB=1))

@@ -19,7 +19,8 @@ LEAST_STD = 0.05
 LEAST_SHARE = 0.25
 OBSERVED_STEPS = 32
 OBSERVED_WORLDS = 256
-HELD_STEPS = 8  # of one random action: otherwise a robot with inertia would hardly move
+# steps for which a random action is held, or a robot with inertia would hardly move
+HELD_STEPS = 8
 
 
 @dataclass(frozen=True)

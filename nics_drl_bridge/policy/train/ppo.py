@@ -80,7 +80,7 @@ class Collector:
             rewards[t] = step.rewards
             ended[t] = step.ended
             endings = step.endings
-            flags = endings.told(SUCCESS), endings.told(COLLISION)
+            flags = endings.get_flag(SUCCESS), endings.get_flag(COLLISION)
             outcomes += zip(*(flag.tolist() for flag in flags), strict=True)
             cut = endings.truncated
             truncated.append(t * count + endings.worlds[cut])
@@ -99,14 +99,14 @@ class Collector:
 
 
 class LeanPpo:
-    """A training with PPO; `normaliser` is mean and deviation (O,)."""
+    """A training with PPO; `statistics` are mean and deviation (O,)."""
 
     def __init__(
         self,
         settings: TrainingSettings,
         worlds: TrainingWorlds,
         seed: int,
-        normaliser: tuple[Array, Array],
+        statistics: tuple[Array, Array],
     ) -> None:
         self._total = settings.steps
         self._ppo = settings.ppo
@@ -122,10 +122,12 @@ class LeanPpo:
         networks.critic.initialise(VALUE_GAIN, initial)
         networks.log_std[:] = self._ppo.log_std
         self.networks = networks
-        see = Normaliser.of(worlds.observation_space, *normaliser)
-        self.algorithm = Actor(see, networks.actor, networks.is_discrete)
+        normaliser = Normaliser.of(worlds.observation_space, *statistics)
+        self.algorithm = Actor(normaliser, networks.actor, networks.is_discrete)
         self.act = self.algorithm.act
-        self.collector = Collector(worlds, networks, see, self._ppo.rollout, collecting)
+        self.collector = Collector(
+            worlds, networks, normaliser, self._ppo.rollout, collecting
+        )
         self.learner = Learner(networks, self._ppo, learning)
         self.steps = 0  # number of steps learnt from, over all worlds
         self._rollout: Rollout | None = None  # the next rollout to learn from

@@ -91,33 +91,35 @@ def train(
     path = folder / CHECKPOINT
     content = checkpoints.read_checkpoint(path) if resumed else None
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
-    joined = make_training_worlds(model, worlds, settings)
-    check_serves(settings, joined.envs[0])
+    training_worlds = make_training_worlds(model, worlds, settings)
+    check_serves(settings, training_worlds.envs[0])
     stop = _stop_of(model, worlds, settings)
-    on_worlds(joined)
+    on_worlds(training_worlds)
     engine = _find_engine(settings)
     if content is None:
         rng = np.random.default_rng(seed)
-        joined.seed(int(rng.integers(SEEDS)))
-        training = engine(settings, joined, seed, observe_statistics(joined, rng))
+        training_worlds.seed(int(rng.integers(SEEDS)))
+        training = engine(
+            settings, training_worlds, seed, observe_statistics(training_worlds, rng)
+        )
         # Overrides the algorithm's seeds, which would overlap those of other runs.
-        joined.seed(int(rng.integers(SEEDS)))
+        training_worlds.seed(int(rng.integers(SEEDS)))
     else:
         check_same(content["about"], about, path)
-        nothing = np.zeros(joined.observation_space.shape)
-        training = engine(settings, joined, seed, (nothing, nothing + 1.0))
-        _restore(content, (training, stop), joined, path)
-    busy = joined.stepping_s
+        nothing = np.zeros(training_worlds.observation_space.shape)
+        training = engine(settings, training_worlds, seed, (nothing, nothing + 1.0))
+        _restore(content, (training, stop), training_worlds, path)
+    busy = training_worlds.stepping_s
 
     def save() -> None:
         # Check before replacing a checkpoint that can still be resumed.
         refuse_diverged(training)
         state = training.state() | stop.state()
-        checkpoints.save_checkpoint(path, state, joined, about)
+        checkpoints.save_checkpoint(path, state, training_worlds, about)
 
     if training.steps < settings.steps and not stop.over:
         log = TrainingLog(folder)
-        watch = Watch(joined, seed, settings, save, tell, stop)
+        watch = Watch(training_worlds, seed, settings, save, tell, stop)
         try:
             training.learn(watch, log)
         except (RuntimeError, ValueError, gymnasium.error.InvalidAction):
@@ -131,7 +133,7 @@ def train(
         training.act,
         training.steps,
         wall_s=time.perf_counter() - begin,
-        stepping_s=joined.stepping_s - busy,
+        stepping_s=training_worlds.stepping_s - busy,
     )
 
 
@@ -195,13 +197,13 @@ def make_training_worlds(
 def _restore(
     content: dict[str, Any],
     parts: Iterable[Training | Stop],
-    joined: TrainingWorlds,
+    training_worlds: TrainingWorlds,
     path: Path,
 ) -> None:
     try:
         for part in parts:
             part.restore(content["state"])
-        for env, arrays in zip(joined.envs, content["envs"], strict=True):
+        for env, arrays in zip(training_worlds.envs, content["envs"], strict=True):
             checkpoints.restore(env, arrays)
     except (
         AttributeError,

@@ -44,14 +44,14 @@ REPLAYED = (
 
 
 class Sb3Training:
-    """A training with a Stable-Baselines3 algorithm; `normaliser` is mean and deviation (O,)."""
+    """A training with a Stable-Baselines3 algorithm; `statistics` are mean and deviation (O,)."""
 
     def __init__(
         self,
         settings: TrainingSettings,
         worlds: TrainingWorlds,
         seed: int,
-        normaliser: tuple[Array, Array],
+        statistics: tuple[Array, Array],
     ) -> None:
         torch.set_num_threads(settings.threads)
         env = TrainVecEnv.of(worlds)
@@ -65,7 +65,7 @@ class Sb3Training:
         network: dict[str, Any] = {
             "net_arch": list(settings.hidden),
             "features_extractor_class": NormaliserLayer,
-            "features_extractor_kwargs": {"mean": normaliser[0], "std": normaliser[1]},
+            "features_extractor_kwargs": {"mean": statistics[0], "std": statistics[1]},
         }
         if settings.algorithm == "sac":
             sac = settings.sac

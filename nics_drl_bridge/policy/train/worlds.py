@@ -28,7 +28,7 @@ class Endings(NamedTuple):
     flags: dict[str, Mask]
     observations: Singles  # (K, O) their last observations
 
-    def told(self, name: str) -> Mask:
+    def get_flag(self, name: str) -> Mask:
         """Returns a flag (K,); False if the task does not tell it."""
         return self.flags.get(name, np.zeros(len(self.worlds), np.bool_))
 
@@ -138,7 +138,7 @@ def _join_endings(parts: Sequence[Endings]) -> Endings:
     worlds, truncated, _, observations = zip(*parts, strict=True)
     names = {name for part in parts for name in part.flags}
     flags = {
-        name: np.concatenate([part.told(name) for part in parts]) for name in names
+        name: np.concatenate([part.get_flag(name) for part in parts]) for name in names
     }
     return Endings(
         np.concatenate(worlds),
