@@ -75,9 +75,9 @@ def kernel(
         )
     options: dict[str, Any] = {"nopython": True, "nogil": True, "error_model": "numpy"}
     options |= {"boundscheck": None, "no_cfunc_wrapper": True}
-    options |= {} if allocates else {"_nrt": False}
-    options |= {"fastmath": {"contract"}} if contracts else {}
-    options |= {"forceinline": True} if inline else {}
+    # Each is set: numba would take those that are not from the kernel that calls this one first.
+    options |= {"_nrt": allocates, "forceinline": inline}
+    options |= {"fastmath": {"contract"} if contracts else False}
     options |= {"inline": "always"} if view else {}
     compiled: Callable[..., Any] = _Kernel(function, targetoptions=options)
     KERNELS.append(compiled)

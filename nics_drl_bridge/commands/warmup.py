@@ -52,7 +52,7 @@ def warmup(
     if for_wheel:
         os.environ |= {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""}
     typer.echo("compiling the kernels: a minute or two, once on this machine", err=True)
-    parts: list[Callable[..., Any]] = [_simulate]
+    parts: list[Callable[..., Any]] = [_step, _draw]
     if for_demo:
         parts += [_estimate, _learn, _guard]
     if all_kernels or for_wheel:
@@ -75,7 +75,10 @@ def _compile(parts: Sequence[Callable[..., Any]], for_wheel: bool) -> tuple[int,
     with get_context("spawn").Pool(workers, _begin, (for_wheel,)) as pool:
         *first, model = pool.apply(_compile_by, (_model,))
         jobs = [pool.apply_async(_compile_by, (part, model)) for part in parts]
-        counts, cpu_s = zip(first, *(job.get()[:2] for job in jobs), strict=True)
+        others = [job.get()[:2] for job in jobs]
+        # It comes last, because it would compile what `_step` and `_draw` compile.
+        *last, _ = pool.apply(_compile_by, (_simulate, model))
+    counts, cpu_s = zip(first, *others, last, strict=True)
     return sum(counts), sum(cpu_s)
 
 
@@ -103,6 +106,21 @@ def _model() -> Any:
     from nics_drl_bridge.generator import builtin_model
 
     return builtin_model(DEFAULT_ROBOT)
+
+
+def _step(model: Any) -> None:
+    import numpy as np
+
+    from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+
+    simulator = BridgeVectorEnv(1, model).simulator
+    simulator.step(np.zeros((1, 1, len(model.robot.command))))
+
+
+def _draw(model: Any) -> None:
+    from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+
+    BridgeVectorEnv(1, model).simulator.episodes.draw([0])
 
 
 def _simulate(model: Any) -> None:

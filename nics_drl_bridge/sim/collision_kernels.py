@@ -513,7 +513,7 @@ def put_in_order(
     first[-1] = len(bodies)  # absent and moving bodies are always found
 
 
-@kernel
+@kernel(inline=True)
 def find_around(n: int, x: float, y: float, reach: float, cells: BodyCells) -> int:
     """Write bodies that may be within `reach` [m] to `cells.found`; return how many."""
     first = cells.first

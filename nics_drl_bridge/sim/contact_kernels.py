@@ -71,7 +71,7 @@ class ContactWorld(NamedTuple):
     period: float  # [s]
 
 
-@kernel
+@kernel(inline=True)
 def find_near(
     n: int,
     m: int,
@@ -459,7 +459,7 @@ def _halt(m: int, begin: float, time: float, end: float, world: ContactWorld) ->
     return True
 
 
-@kernel
+@kernel(inline=True)
 def move_obstacles(
     bodies: Array,
     start: Array,
@@ -472,7 +472,7 @@ def move_obstacles(
         _place_obstacle(bodies[n, k], start[k], velocity[n, k], time)
 
 
-@kernel
+@kernel(inline=True)
 def put_body(body: Array, pose: Array) -> None:
     """Place a body at a pose (3,)."""
     body[X] = pose[0]

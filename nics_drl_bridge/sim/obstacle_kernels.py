@@ -91,7 +91,7 @@ def reset_marks(n: int, data: State, plans: Records) -> None:
         mark.way = 1
 
 
-@kernel
+@kernel(inline=True)
 def steer(
     n: int,
     data: State,
@@ -221,7 +221,7 @@ def repulsion(
     )
 
 
-@kernel
+@kernel(inline=True)
 def _from_bodies(
     k: int,
     ex: float,
@@ -271,7 +271,7 @@ def _from_bodies(
     return ax, ay
 
 
-@kernel
+@kernel(inline=True)
 def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
     body = traffic.bodies[k]
     row = traffic.plans[k]
@@ -319,7 +319,7 @@ def _choose_goal(
     return away
 
 
-@kernel
+@kernel(inline=True)
 def _walk(k: int, n: int, traffic: Traffic, data: State) -> tuple[float, float]:
     """Return the next velocity of walker k in `map` [m/s]; makes < `DRAWS` draws."""
     seed = data.seeds[n]
@@ -559,7 +559,7 @@ def _find_free_part(
     return free
 
 
-@kernel
+@kernel(inline=True)
 def restrain(
     dx: float,
     dy: float,

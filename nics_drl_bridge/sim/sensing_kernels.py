@@ -43,7 +43,7 @@ from nics_drl_bridge.sim.state import (
 FURTHEST_BACK = 1.0
 
 
-@kernel
+@kernel(inline=True)
 def measure_odometry(
     n: int,
     m: int,
@@ -119,7 +119,7 @@ def measure_odometry(
     interpolate_past(past, ODOM_TWIST, lag, steps, substeps, odom_twist)
 
 
-@kernel
+@kernel(inline=True)
 def record_truth(n: int, m: int, pose: Array, twist: Array, data: State) -> None:
     """Keep the true pose (3,) and body twist (3,) or more of a robot at the end of a period."""
     row = data.past[n, m, data.steps[n] % data.past.shape[2]]
@@ -128,7 +128,7 @@ def record_truth(n: int, m: int, pose: Array, twist: Array, data: State) -> None
         row[TRUE_TWIST + i] = twist[i]
 
 
-@kernel
+@kernel(inline=True)
 def _draw_odometry_noise(n: int, m: int, axis: int, data: State) -> float:
     """Draw the noise of the twist: forward (axis 0), left (1), turn rate (2)."""
     std = data.noise[n, m, ODOM_ANGULAR if axis == 2 else ODOM_LINEAR]

@@ -375,7 +375,7 @@ def _find_what_is_near(
     return obstacles_move
 
 
-@kernel
+@kernel(inline=True)
 def _move_carefully(
     n: int, obstacles_move: bool, scene: Surroundings, part: Part
 ) -> None:
@@ -439,7 +439,7 @@ def _move_carefully(
                 data.velocity[n, k, i] *= stops[k] / period
 
 
-@kernel
+@kernel(inline=True)
 def compute_rates(
     n: int,
     m: int,
@@ -464,7 +464,7 @@ def compute_rates(
     )
 
 
-@kernel
+@kernel(inline=True)
 def draw_drift(
     n: int, m: int, data: State, motion: Dynamics
 ) -> tuple[float, float, float]:
