@@ -211,3 +211,19 @@ def test_a_bound_kernel_takes_what_its_arrays_hold_when_it_is_called():
         assert np.array_equal(out, np.full((1, 2), 2.0 + 2.0 * number))
     actions[0, 1] = np.nan
     assert scale() is False
+
+
+@kernels.kernel
+def _multiply_add(a: float, b: float, c: float) -> float:
+    return a * b + c
+
+
+@kernels.kernel(contracts=True)
+def _call_it_fused(a: float, b: float, c: float) -> float:
+    return _multiply_add(a, b, c)
+
+
+def test_a_kernel_rounds_as_it_says_whichever_kernel_calls_it_first():
+    # The product is 1 + 2 tiny + tiny^2; rounded before the sum, it loses tiny^2.
+    tiny = 2.0**-27
+    assert _call_it_fused(1.0 + tiny, 1.0 + tiny, -(1.0 + 2.0 * tiny)) == 0.0
