@@ -18,7 +18,7 @@ from nics_drl_bridge.gate.state import Cause, GateConfig, GateState
 from nics_drl_bridge.nodes import black_box_writer
 from nics_drl_bridge.nodes.black_box_writer import FILES_KEPT
 from nics_drl_bridge.nodes.listener import holds
-from nics_drl_bridge.nodes.node_process import make_module_command
+from nics_drl_bridge.nodes.processes import make_module_command
 from nics_drl_bridge.nodes.runner import ERROR, OK, STALE, WARN, Condition
 
 BURST_S = (

@@ -34,7 +34,7 @@ from nics_drl_bridge.nodes.parameters import (
     NO_POSE,
     POSE_TYPES,
     STAMPED,
-    list_sensor_rows,
+    list_rows,
 )
 from nics_drl_bridge.nodes.runner import declare_row, get_flag, get_text
 from nics_drl_bridge.recording import messages
@@ -49,9 +49,8 @@ KINDS_OF_POSE = {
 
 def declare_sensors(node: Node, stamped: bool | None = None) -> None:
     """Declare a robot's sensors except scan and odometry, and the command type, if known."""
-    for row in list_sensor_rows():
-        if row.name == STAMPED and stamped is not None:
-            row = row._replace(default=stamped)
+    known = {} if stamped is None else {STAMPED: stamped}
+    for row in list_rows("sensors", "stamped", **known):
         declare_row(node, row)
 
 

@@ -36,6 +36,7 @@ TABLE = Path("/proc/net/udp")
 # RTPS: the first port of a domain is for multicast
 FIRST_PORT = 7400
 PORTS_OF_A_DOMAIN = 250
+GREATEST_DOMAIN_ID = 232  # above it, DDS has no ports
 
 
 def set_transport(environment: MutableMapping[str, str]) -> None:
