@@ -1,12 +1,11 @@
 """simulator_node: the fast simulator, or another one, behind the topics of the hardware."""
 
-import heapq
 import itertools
 import math
 import time
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from diagnostic_msgs.srv import SelfTest
@@ -69,14 +68,20 @@ LONGEST_TICK_S = 0.005
 MakeSimulator = Callable[[Node, SimulatorModel, AnyWorld, int], FastSimulator]
 
 
+class Waiting(NamedTuple):
+    """A message that is to be published later."""
+
+    due_ns: int
+    publisher: Publisher
+    content: bytes
+
+
 class Outbox:
     """Publishes messages after a latency and a jitter, or at once; each topic keeps its order."""
 
     def __init__(self) -> None:
         self._random = np.random.default_rng(0)
-        self._waiting: list[tuple[int, int, Publisher, bytes]] = []
-        self._latest: dict[Publisher, int] = {}
-        self._numbers = itertools.count()
+        self._waiting: list[Waiting] = []
 
     def send(
         self, publisher: Publisher, message: Any, now_ns: int, late: tuple[int, int]
@@ -88,30 +93,25 @@ class Outbox:
         if not delay:
             publisher.publish(message)
             return
-        due = max(now_ns + delay, self._latest.get(publisher, 0))
-        self._latest[publisher] = due
+        before = (each for each in self._waiting if each.publisher is publisher)
+        due_ns = max((now_ns + delay, *(each.due_ns for each in before)))
         content = message if isinstance(message, bytes) else serialize_message(message)
-        heapq.heappush(self._waiting, (due, next(self._numbers), publisher, content))
+        self._waiting.append(Waiting(due_ns, publisher, content))
 
     def flush(self, now_ns: int) -> None:
         """Publish what is due."""
-        while self._waiting and self._waiting[0][0] <= now_ns:
-            _, _, publisher, content = heapq.heappop(self._waiting)
-            publisher.publish(content)
+        due = [each for each in self._waiting if each.due_ns <= now_ns]
+        self._waiting = [each for each in self._waiting if each.due_ns > now_ns]
+        for each in sorted(due, key=lambda each: each.due_ns):
+            each.publisher.publish(each.content)
 
     def drop(self, publishers: Collection[Publisher]) -> None:
         """Drop the waiting messages of publishers that are about to end."""
-        self._waiting = [
-            waiting for waiting in self._waiting if waiting[2] not in publishers
-        ]
-        heapq.heapify(self._waiting)
-        for publisher in publishers:
-            self._latest.pop(publisher, None)
+        self._waiting = [w for w in self._waiting if w.publisher not in publishers]
 
     def clear(self) -> None:
         """Drop all waiting messages, because their episode is over."""
         self._waiting.clear()
-        self._latest.clear()
 
 
 class RobotPort:

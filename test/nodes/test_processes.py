@@ -79,12 +79,12 @@ def test_a_node_that_ended_by_itself_is_named_with_its_code_and_log(
     for name in ("yaml", "numpy", "numba", "rclpy"):
         (tmp_path / f"{name}.py").write_text(f"open({str(canary)!r}, 'w')\n")
     monkeypatch.chdir(tmp_path)
-    wrong = {"policy": "dynamic_widow"}
-    with NodeProcess("policy_node", tmp_path / "log", wrong, domain_id) as node:
+    wrong = {"robot": "differntial"}
+    with NodeProcess("record_node", tmp_path / "log", wrong, domain_id) as node:
         wait_for(lambda: node.poll() is not None, "its end")
         expected = (
-            "policy_node ended with code 2: unknown policy 'dynamic_widow'; did you mean "
-            f"'dynamic_window'? (its log is {node.log})."
+            "record_node ended with code 2: unknown robot 'differntial'; did you mean "
+            f"'differential'? (its log is {node.log})."
         )
         with pytest.raises(BackendError, match=f"^{re.escape(expected)}$"):
             node.check()
