@@ -317,7 +317,7 @@ class Surroundings(ExitStack):
             twist = model.robot.to_cmd_vel(command)
         self.processes: dict[str, NodeProcess] = {}
         has_policy = self._fault.policy
-        self.robot = Robot(
+        self.robot: Robot = Robot(
             self._domain_id, model, twist, has_policy, relayed=not setup.gated
         )
         self.callback(self.robot.close)

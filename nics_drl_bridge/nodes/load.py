@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -164,7 +165,7 @@ def _run_nodes(
         limits = folder / "limits.yaml"  # that hardly limit the robot
         text = dump_yaml({"robot": model.robot.name, "commands": commands})
         limits.write_text(text, encoding="utf-8")
-        parameters = {
+        parameters: dict[str, dict[str, Any]] = {
             "middleware_node": {"imu": "none"},
             "policy_node": {"imu": "none", "policy": policy, "goal": GOAL, "rate": 0.0},
             "command_gate": {

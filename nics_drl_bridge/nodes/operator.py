@@ -6,7 +6,6 @@ It imports no simulator and no kernels: an emergency stop must not wait for seco
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
@@ -84,6 +83,7 @@ class GoalRequest(NamedTuple):
 
 
 Answer = TypeVar("Answer", TriggerAnswer, GoalAnswer)
+OperatorT = TypeVar("OperatorT", bound="Operator")
 
 
 def ask_until_granted(
@@ -135,7 +135,7 @@ def get_namespace_of(name: str) -> str:
     return name.rpartition("/")[0]
 
 
-class Operator(AbstractContextManager["Operator", None]):
+class Operator:
     """A node that calls gates and sends goals; a context manager. Raises BackendError."""
 
     def __init__(self, domain_id: int | None = None) -> None:
@@ -292,6 +292,9 @@ class Operator(AbstractContextManager["Operator", None]):
                     status.message,
                     values,
                 )
+
+    def __enter__(self: OperatorT) -> OperatorT:
+        return self
 
     def __exit__(self, *_: object) -> None:
         self._node.close()

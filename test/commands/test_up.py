@@ -220,8 +220,6 @@ def test_a_simulation_is_armed_driven_stopped_and_ended_by_nics_alone(start):
         assert "e_stop_released: e_stop_pressed" in refused.stderr
         again = up.tell("arm --reset")
         assert again.returncode == 0, again.stderr
-        behind = up.tell("goal -1 0 --frame base_link")
-        assert behind.returncode == 0, behind.stderr
         nowhere = up.tell("goal 1 0 --frame kitchen --wait 3")
         assert nowhere.returncode == 1
         assert "a goal in the frame 'kitchen' is refused" in nowhere.stderr

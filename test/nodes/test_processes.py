@@ -84,7 +84,7 @@ def test_a_node_that_ended_by_itself_is_named_with_its_code_and_log(
         wait_for(lambda: node.poll() is not None, "its end")
         expected = (
             "record_node ended with code 2: unknown robot 'differntial'; did you mean "
-            f"'differential'? (its log is {node.log})."
+            f"'differential'? (or give the path of a YAML file). (its log is {node.log})."
         )
         with pytest.raises(BackendError, match=f"^{re.escape(expected)}$"):
             node.check()
