@@ -157,7 +157,13 @@ setup(
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={
         # `make wheel` writes the machine code.
-        PACKAGE: ["py.typed", "nodes/*.xml", "watch/*.html", "machine_code/*"]
+        PACKAGE: [
+            "py.typed",
+            "nodes/*.xml",
+            "nodes/*.yaml",
+            "watch/*.html",
+            "machine_code/*",
+        ]
     },
     data_files=data_files(),
     zip_safe=False,

@@ -596,11 +596,11 @@ def measure_vehicle(given: Given) -> Result:
     of p99 (to `cmd_vel_raw`) and memory are for a quarter of a core at 20 Hz, that of the median
     for a core at 10 Hz.
     """
-    from nics_drl_bridge.nodes import load, node_process
+    from nics_drl_bridge.nodes import load, processes
 
     if given.control == "slow":
-        make_command = node_process.make_module_command
-        node_process.make_module_command = lambda module: [
+        make_command = processes.make_module_command
+        processes.make_module_command = lambda module: [
             word.replace("; from", SLOW_POLICY) for word in make_command(module)
         ]
     loads, _ = load.measure_load(peers.MODEL, "differential", given.seconds)

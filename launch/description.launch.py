@@ -8,4 +8,4 @@ from nics_drl_bridge.nodes.starting import LAUNCHES
 
 
 def generate_launch_description():
-    return describe(LAUNCHES["description"]())
+    return describe(LAUNCHES["description"])

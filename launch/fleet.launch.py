@@ -9,4 +9,4 @@ from nics_drl_bridge.nodes.starting import LAUNCHES
 
 
 def generate_launch_description():
-    return describe(LAUNCHES["fleet"]())
+    return describe(LAUNCHES["fleet"])

@@ -10,4 +10,4 @@ from nics_drl_bridge.nodes.starting import LAUNCHES
 
 
 def generate_launch_description():
-    return describe(LAUNCHES["simulation"]())
+    return describe(LAUNCHES["simulation"])

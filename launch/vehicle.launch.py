@@ -11,4 +11,4 @@ from nics_drl_bridge.nodes.starting import LAUNCHES
 
 
 def generate_launch_description():
-    return describe(LAUNCHES["vehicle"]())
+    return describe(LAUNCHES["vehicle"])

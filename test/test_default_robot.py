@@ -10,7 +10,7 @@ from nics_drl_bridge.config import parse_yaml, share_folder
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.nodes.parameters import NODES
+from nics_drl_bridge.nodes.parameters import describe_node, list_nodes
 from nics_drl_bridge.policy.train.settings import TrainingSettings, chosen_settings
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
@@ -39,8 +39,8 @@ def test_every_command_env_and_node_that_has_a_default_robot_has_the_same():
     found = [default for function in functions for default in defaults_of(function)]
     found += [
         row.default
-        for facts in NODES.values()
-        for row in facts().parameters
+        for facts in map(describe_node, list_nodes())
+        for row in facts.parameters
         if row.name in NAMES
     ]
     found += [env.model.robot.name for env in envs]

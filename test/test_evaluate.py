@@ -137,7 +137,8 @@ def test_several_policies_drive_the_same_episodes_in_one_table(tmp_path):
 def far_from_the_origin(tmp_path, monkeypatch, domain_id):
     """A robot on a wide field whose odometry began elsewhere, behind what a gate listens to."""
     from nics_drl_bridge.commands import episodes as vehicle
-    from nics_drl_bridge.nodes.processes import NodeProcess, Witness
+    from nics_drl_bridge.nodes.operator import Witness
+    from nics_drl_bridge.nodes.processes import NodeProcess
 
     world = tmp_path / "wide.yaml"
     world.write_text(
@@ -237,7 +238,8 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(
     tmp_path, monkeypatch, domain_id
 ):
     from nics_drl_bridge.commands import episodes as vehicle
-    from nics_drl_bridge.nodes.processes import NodeProcess, Witness
+    from nics_drl_bridge.nodes.operator import Witness
+    from nics_drl_bridge.nodes.processes import NodeProcess
 
     limits = {
         one.name: {"min": one.min, "max": one.max, "rate": 20.0, "jerk": 400.0}

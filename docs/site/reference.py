@@ -21,7 +21,13 @@ from nics_drl_bridge.extras.foreign_policies.mapping import ForeignPolicy
 from nics_drl_bridge.gate.limits import LimitsFile
 from nics_drl_bridge.lidar.maps import MapFile
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.nodes.parameters import GREATEST_SEED, NODES, STAMPED, Row
+from nics_drl_bridge.nodes.parameters import (
+    GREATEST_SEED,
+    STAMPED,
+    Row,
+    describe_node,
+    list_nodes,
+)
 from nics_drl_bridge.policy.train.settings import TrainingSettings
 from nics_drl_bridge.recording.mapping import DriveMapping
 from nics_drl_bridge.recording.topic_roles import TopicRoles
@@ -316,7 +322,7 @@ def parameter_row(row: Row) -> str:
 
 def node_section(node: str) -> str:
     """What a node does, its topics, services and parameters, and an example."""
-    facts = NODES[node]()
+    facts = describe_node(node)
     heads = ("subscribes to", "publishes", "services")
     lines = [f"## {node}\n", facts.about, "", "| | |", "|---|---|"]
     for head in heads:
@@ -337,7 +343,7 @@ def pages() -> dict[str, str]:
     head = (
         "# Nodes\n\nEvery node, as shown by `ros2 run nics_drl_bridge NODE --help`.\n"
     )
-    found["nodes.md"] = "\n".join([head, *map(node_section, NODES)])
+    found["nodes.md"] = "\n".join([head, *map(node_section, list_nodes())])
     return found
 
 

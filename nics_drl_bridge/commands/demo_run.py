@@ -298,11 +298,8 @@ class Demo:
     def _watch_episode(
         self, nodes: dict[str, dict[str, Any]], goal: list[float], near: float
     ) -> tuple[bool, Any]:
-        from nics_drl_bridge.nodes.processes import (
-            NodeProcess,
-            Witness,
-            free_domain_id,
-        )
+        from nics_drl_bridge.nodes.operator import Witness
+        from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
         domain_id = free_domain_id()
         logs = self._plan.out / "logs" / "realtime"
@@ -319,11 +316,11 @@ class Demo:
                         f"{node} publishes nothing after {START_S:g} s; look at its log, "
                         f"{process.log}."
                     )
-            refused = witness.arms("command_gate", START_S)
+            armed = witness.arm("", START_S, False, lambda _: None)
             for process in processes:
                 process.check()
-            if refused:
-                raise BackendError(f"command_gate can't be armed: {refused}")
+            if not armed.granted:
+                raise BackendError(f"command_gate can't be armed: {armed.told}")
             self._say(
                 "  command_gate is armed; no emergency stop is required of a simulation"
             )

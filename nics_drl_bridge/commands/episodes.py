@@ -134,7 +134,8 @@ def drive_in(
         env, opened = open_env(policy, model, world, "sim", conditions, **options)
         with closing(env):
             return drive_all(env, opened, seeds, on_episode)
-    from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
+    from nics_drl_bridge.nodes.operator import Witness
+    from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
     node = NODES[place]
     domain_id = free_domain_id()
@@ -650,11 +651,10 @@ def report_end(episode: Episode) -> str:
 def _arm(wanted: bool, namespace: str, say: Say) -> None:
     if not wanted:
         return
-    from nics_drl_bridge.nodes.processes import Witness
+    from nics_drl_bridge.nodes.operator import Operator
 
-    gate = f"{namespace}/{GATE}" if namespace else GATE
-    with Witness() as witness:
-        refused = witness.arms(gate, ARM_S)
-    if refused:
-        raise BackendError(f"{gate} can't be armed: {refused}")
-    say(f"  {gate} is armed")
+    with Operator() as operator:
+        armed = operator.arm(namespace, ARM_S, False, say)
+    if not armed.granted:
+        raise BackendError(f"{armed.node} can't be armed: {armed.told}")
+    say(f"  {armed.node} is armed")

@@ -15,7 +15,7 @@ from nics_drl_bridge import extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
-from nics_drl_bridge.nodes.node_process import ChildProcess, make_command
+from nics_drl_bridge.nodes.processes import ChildProcess, make_command
 from nics_drl_bridge.nodes.starting import LAUNCHES, Launch, NodeStart, complete
 
 EXIT_NODE_ENDED = 1
@@ -51,7 +51,7 @@ def up(
     """Starts the nodes of a simulation, vehicle or fleet."""
     if what not in LAUNCHES:
         raise ConfigError(f"nics up can't start {what!r}; {suggest(what, LAUNCHES)}")
-    launch = LAUNCHES[what]()
+    launch = LAUNCHES[what]
     if show_args:
         typer.echo(format_arguments(launch))
         return

@@ -53,9 +53,14 @@ from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.own_process import take_priority
 
 SIM_TIME = "use_sim_time"
+FOREIGN = "foreign_commands"
+SPLIT = {  # parameters of earlier versions, and what replaced them
+    "estimate_std": "'estimate_position' [m] and 'estimate_heading' [rad], which limit how much "
+    "the estimate's uncertainty grows within 10 s, counted from arming",
+}
 FOREIGN_SETTINGS = {
-    command_types.TWIST: f"{parameters.FOREIGN.name}:={TWIST}",
-    command_types.TWIST_STAMPED: f"{parameters.FOREIGN.name}:={TWIST_STAMPED}",
+    command_types.TWIST: f"{FOREIGN}:={TWIST}",
+    command_types.TWIST_STAMPED: f"{FOREIGN}:={TWIST_STAMPED}",
 }
 # maximum age of a decision; an older one is made again [s]
 STALE_S = 0.05
@@ -66,17 +71,21 @@ SCAN_PERIODS = 1.75
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     """Declare and read a gate's parameters, and log doubts. Raises ConfigError for a bad value."""
     given = qos.get_given_values(node)
-    for name in sorted(parameters.SPLIT.keys() & given.keys()):
-        raise ConfigError(f"parameter {name!r}: is now {parameters.SPLIT[name]}.")
-    scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
-    rules = parameters.list_gate_rules(1.0 / model.control_period, scan_age)
-    for row in (*rules, *parameters.list_gate_rows()):
-        runner.declare_row(node, row)
-    file = runner.get_text(node, parameters.LIMITS.name)
+    for name in sorted(SPLIT.keys() & given.keys()):
+        raise ConfigError(f"parameter {name!r}: is now {SPLIT[name]}.")
+    rules = parameters.list_gate_rules(
+        odom_rate=1.0 / model.control_period,
+        scan_age=max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate),
+    )
+    values = {}
+    for row in rules:
+        field = row.name
+        if hasattr(GateConfig, f"{field}_s"):
+            field = f"{field}_s"
+        values[field] = runner.declare_row(node, row)
+    runner.declare_rows(node, "gate", "stamped")
+    file = runner.get_text(node, "limits")
     limits = load_limits(file, model.robot) if file else None
-    values = {row.name: node.get_parameter(row.name).value for row in rules}
-    for name in parameters.RULES_IN_SECONDS:
-        values[f"{name}_s"] = values.pop(name)
     config = make_gate_config(
         model,
         limits,
@@ -107,7 +116,7 @@ def _keep_clock(simulated: bool, parameters: list[Parameter]) -> SetParametersRe
 
 def find_black_box(node: Node) -> Path:
     """Return the folder for recordings of stops of a node in its namespace."""
-    folder = runner.get_text(node, parameters.BLACK_BOX.name)
+    folder = runner.get_text(node, "black_box")
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     # A gate in another namespace must not remove its files.
     return (Path(folder) if folder else home / "black_box") / str(
@@ -119,11 +128,11 @@ def _read_shield(
     node: Node, model: SimulatorModel, limits: Limits | None, file: str
 ) -> ShieldConfig | None:
     values = {}
-    for row in parameters.SHIELD_NUMBERS:
-        value = runner.get_number(node, row.name)
+    for name in ("latency", "deceleration", "margin", "obstacle_speed"):
+        value = runner.get_number(node, f"shield_{name}")
         if not math.isnan(value):
-            values[row.name.removeprefix("shield_")] = value
-    if not runner.get_flag(node, parameters.SHIELD.name):
+            values[name] = value
+    if not runner.get_flag(node, "shield"):
         node.get_logger().warning("the shield is off: obstacles do not stop the robot")
         return None
     config, sentence = shield_config(model, limits, file, values)
@@ -152,9 +161,9 @@ class CommandGate(qos.BridgeNode):
             shield.warm_up()
         scan_motion.warm_up(self._config)
         self._stamped = runner.get_flag(self, parameters.STAMPED)
-        self._frame = runner.get_text(self, parameters.ROBOT_FRAME.name)
+        self._frame = runner.get_text(self, parameters.BASE_FRAME)
         fault = parameters.find_frame_fault(
-            self.get_parameters_by_prefix("").values(), parameters.ROBOT_FRAME.name
+            self.get_parameters_by_prefix("").values(), parameters.BASE_FRAME
         )
         if fault:
             raise ConfigError(fault)
@@ -164,7 +173,7 @@ class CommandGate(qos.BridgeNode):
         self._listen()
         runner.call_periodically(self, PERIOD_S, self._tick)
         runner.diagnose(self, "gate", self._look)
-        refused = take_priority(self.get_parameter(parameters.PRIORITY.name).value)
+        refused = take_priority(self.get_parameter("priority").value)
         if refused:  # once all threads exist
             logger.warning(refused)
 
@@ -180,7 +189,7 @@ class CommandGate(qos.BridgeNode):
             ),
         )
         kinds = ("none", TWIST, TWIST_STAMPED)
-        raw = device_parameters.get_choice(self, parameters.FOREIGN.name, kinds)
+        raw = device_parameters.get_choice(self, FOREIGN, kinds)
         raw_kind = command_types.name_of(stamped=raw != TWIST)
         command_types.TypeWatch(self, inputs.RAW, raw_kind, FOREIGN_SETTINGS)
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (

@@ -22,9 +22,8 @@ from std_msgs.msg import Header
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.maps import GridMap
-from nics_drl_bridge.lidar.sectors import Reader, match_reader
 from nics_drl_bridge.lidar.sensor import Sensor
-from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, to_device
+from nics_drl_bridge.lidar.spec import LidarSpec, to_device
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.recording.topic_roles import TRANSFORMS
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -90,12 +89,6 @@ def scan_to_ros(
         setattr(message, field, value)
     message.ranges = array.array("f", to_device(ranges, spec).tobytes())
     return message
-
-
-def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool) -> Reader:
-    """Return the reader of the lidar that a header describes. Raises ConfigError."""
-    header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
-    return match_reader(header, len(message.ranges), like, upside_down)
 
 
 def odometry_to_ros(
@@ -247,19 +240,16 @@ def find_message_type(kind: str) -> Any | None:
     if named is None:
         return None
     package, interface, name = named.groups()
-    if package not in sys.modules and not _has_interfaces(package, interface):
-        return None
+    if package not in sys.modules:  # nothing is imported to find out what it has
+        spec = find_spec(package)
+        folders = (spec.submodule_search_locations if spec is not None else None) or ()
+        files = (Path(folder, interface, "__init__.py") for folder in folders)
+        if not any(map(Path.is_file, files)):
+            return None
     try:
         return getattr(import_module(f"{package}.{interface}"), name, None)
     except ImportError:
         return None
-
-
-def _has_interfaces(package: str, interface: str) -> bool:
-    """True if an installed package has messages; nothing is imported to find out."""
-    spec = find_spec(package)
-    folders = (spec.submodule_search_locations if spec is not None else None) or ()
-    return any(Path(folder, interface, "__init__.py").is_file() for folder in folders)
 
 
 def transforms_type() -> Any | None:

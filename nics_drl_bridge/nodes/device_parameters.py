@@ -15,12 +15,11 @@ from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes.parameters import (
     LOCKSTEP,
     MODES,
-    ROBOTS,
     find_frame_fault,
-    list_device_rows,
+    list_rows,
     name_fleet,
 )
-from nics_drl_bridge.nodes.runner import declare_row, get_number, get_text
+from nics_drl_bridge.nodes.runner import declare_rows, get_number, get_text
 from nics_drl_bridge.pacing import find_common_step
 from nics_drl_bridge.robot.noise import Delay
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
@@ -59,14 +58,14 @@ class Frames(NamedTuple):
 
 def declare_device(node: Node, laser_frame: str) -> None:
     """Declare and check the parameters that all simulators share. Raises ConfigError."""
+    (robots,) = list_rows("fleet")
     fleet = ParameterDescriptor(
-        description=ROBOTS.about, read_only=True, dynamic_typing=True
+        description=robots.about, read_only=True, dynamic_typing=True
     )
-    node.declare_parameter(ROBOTS.name, ROBOTS.default, fleet)
+    node.declare_parameter(robots.name, robots.default, fleet)
     # Added before the others are declared, so that it also checks the values at startup.
     node.add_on_set_parameters_callback(partial(_check_episode, node))
-    for row in list_device_rows(laser_frame):
-        declare_row(node, row)
+    declare_rows(node, "device", "stamped", laser_frame=laser_frame)
     fault = find_frame_fault(node.get_parameters_by_prefix("").values())
     if fault:
         raise ConfigError(fault)
@@ -153,7 +152,7 @@ def get_frames(node: Node, namespace: str) -> Frames:
 
 def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResult:
     reason = ""
-    needed = 3 * len(name_fleet(node.get_parameter(ROBOTS.name).value))
+    needed = 3 * len(name_fleet(node.get_parameter("robots").value))
     for parameter in parameters:
         if parameter.name != START:
             continue

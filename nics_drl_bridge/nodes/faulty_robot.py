@@ -4,21 +4,21 @@ import math
 import multiprocessing
 import time
 from collections.abc import Callable, Mapping
-from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.qos import QoSProfile
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.spun_node import SpunNode
+from nics_drl_bridge.nodes.command_ear import hear, listen_to_commands
+from nics_drl_bridge.nodes.listener import SpunNode
 
 PERIOD_S = 0.1  # about the time between two scans
 PATIENCE_S = 60.0
@@ -27,25 +27,8 @@ RECENT_S = 0.15  # greatest age of the command that moves the robot when it is b
 ALL = frozenset({"scan", "odom", "odometry/filtered", "cmd_vel_raw", "e_stop"})
 
 
-class NoMotionError(RuntimeError):
-    """The gate was armed, but no command that moves the robot came."""
-
-
-def hear(domain_id: int | None, out: Connection) -> None:
-    """Report for each `cmd_vel` when it arrived [s], its twist, and when it was written [ns].
-
-    Ends with the parent process, even if that is killed.
-    """
-    base = SpunNode("base", domain_id)
-
-    def tell(message: Twist, info: Mapping[str, Any]) -> None:
-        twist = conversions.twist_from_ros(message)
-        out.send((time.monotonic(), twist, info["source_timestamp"]))
-
-    base.node.create_subscription(Twist, "cmd_vel", tell, qos.COMMAND)
-    parent = multiprocessing.parent_process()
-    while parent is None or parent.is_alive():
-        base.spin(timeout_s=1.0)
+class NoMotionError(BackendError):
+    """The gate did not arm, or no command that moves the robot came."""
 
 
 class Robot(SpunNode):
@@ -55,6 +38,8 @@ class Robot(SpunNode):
     killed one may be blocked by the middleware for a second, and would notice the stop late.
     """
 
+    quality = qos.COMMAND  # of its topics
+
     def __init__(
         self,
         domain_id: int | None,
@@ -63,8 +48,7 @@ class Robot(SpunNode):
         policy: bool = False,
         relayed: bool = False,
         odom_hz: float = 0.0,
-        skip: int = 1,
-        sensors: QoSProfile = qos.COMMAND,
+        has_base: bool = True,
     ) -> None:
         """Publish the robot's topics.
 
@@ -75,22 +59,24 @@ class Robot(SpunNode):
             policy: True if the policy of another node commands instead.
             relayed: True if commands bypass the gate.
             odom_hz: rate of odometry and estimate, a multiple of the lidar's; 0: the model's.
-            skip: send only every so many-th scan, heartbeat and command.
-            sensors: quality of service of scan and odometry.
+            has_base: True if a process of its own receives the commands, see above.
         """
         super().__init__("robot", domain_id)
-        kinds = {
-            "odom": (Odometry, sensors),
-            "scan": (LaserScan, sensors),
-            "e_stop": (Bool, qos.COMMAND),
-            "cmd_vel_raw": (TwistStamped, qos.COMMAND),
-            "odometry/filtered": (Odometry, qos.COMMAND),
+        kinds: dict[str, Any] = {
+            "odom": Odometry,
+            "scan": LaserScan,
+            "e_stop": Bool,
+            "cmd_vel_raw": TwistStamped,
+            "odometry/filtered": Odometry,
         }
+        for sensor in model.sensors:
+            kinds[sensor.name] = conversions.find_sensor_type(sensor)
         self._topics = {
-            name: self.node.create_publisher(kind, name, profile)
-            for name, (kind, profile) in kinds.items()
+            name: self.node.create_publisher(kind, name, self.quality)
+            for name, kind in kinds.items()
         }
         self._lidar = model.lidar
+        self._sensors = model.sensors
         self._twist = twist
         self._policy = policy
         self._relayed = relayed
@@ -99,7 +85,10 @@ class Robot(SpunNode):
         spawning = multiprocessing.get_context("spawn")
         self._ear, out = spawning.Pipe(duplex=False)
         self._base = spawning.Process(target=hear, args=(domain_id, out), daemon=True)
-        self._base.start()
+        if has_base:
+            self._base.start()
+        else:
+            listen_to_commands(self.node, out)
         self.node.create_subscription(
             TwistStamped, "cmd_vel_raw", self._hear_policy, qos.COMMAND
         )
@@ -107,9 +96,9 @@ class Robot(SpunNode):
         if odom_hz == 0.0:
             needed = 1.0 / (model.control_period * scan_hz)
             odom_hz = scan_hz * max(1, math.ceil(needed - 1e-9))
-        self._every = skip * round(odom_hz / scan_hz)
+        self.odom_per_scan = round(odom_hz / scan_hz)
         self._ticks = 0
-        self.node.create_timer(1.0 / odom_hz, self._send)
+        self._timer = self.node.create_timer(1.0 / odom_hz, self._send)
         self._offset_ns = time.time_ns() - time.monotonic_ns()
         self._now_ns = 0
         self._position = np.zeros(2)
@@ -118,8 +107,20 @@ class Robot(SpunNode):
         # may come from the policy of another node.
         self.sent_s = dict.fromkeys(ALL, 0.0)
         self.last: dict[str, Any] = {}
-        self.sent = dict.fromkeys(ALL, 0)  # number of messages
+        self.sent = dict.fromkeys(kinds, 0)  # number of messages
+        self.scans_ns: list[int] = []  # stamps
+        # stamp of a scan -> when a command that was computed from it arrived [ns], both on
+        # the system clock
+        self.answers_ns: dict[int, int] = {}
         self.repair()
+
+    def set_rate(self, rate: float) -> None:
+        """Publish scans at another rate [Hz], and all other topics in proportion."""
+        self._timer.timer_period_ns = round(NS_PER_S / rate / self.odom_per_scan)
+
+    def to_system_ns(self, time_s: float) -> int:
+        """Return a time of the steady clock [s] on the clock of the stamps [ns]."""
+        return round(time_s * NS_PER_S) + self._offset_ns
 
     def repair(self) -> None:
         """Remove all faults."""
@@ -132,9 +133,12 @@ class Robot(SpunNode):
         # commands that were written before are ignored, on the system clock
         self.since_ns = 0
 
-    def _hear_policy(self, message: TwistStamped) -> None:
+    def _hear_policy(self, message: TwistStamped, info: Mapping[str, Any]) -> None:
         if self._policy and not self.republished:
             self.last["cmd_vel_raw"] = message
+            stamp_ns = conversions.stamp_from_ros(message.header.stamp)
+            arrival_ns = info.get("received_timestamp") or time.time_ns()
+            self.answers_ns.setdefault(stamp_ns, int(arrival_ns))
 
     def _send(self) -> None:
         velocity = np.zeros(2)
@@ -155,7 +159,7 @@ class Robot(SpunNode):
         self._publish("odom", odometry)
         self._publish("odometry/filtered", odometry)
         self._ticks += 1
-        if self._ticks % self._every:
+        if self._ticks % self.odom_per_scan:
             return
         ranges = np.full(
             self._lidar.beams, 2.0 + 0.1 * np.sin(self._now_ns * 1e-9), np.float32
@@ -163,6 +167,11 @@ class Robot(SpunNode):
         self._publish(
             "scan", conversions.scan_to_ros(self._lidar, ranges, stamp, "laser")
         )
+        self.scans_ns.append(stamp)
+        for sensor in self._sensors:
+            reading = np.zeros(sensor.size, np.float32)
+            message = conversions.sensor_to_ros(sensor, reading, stamp, sensor.frame)
+            self._publish(sensor.name, message)
         self._publish("e_stop", Bool(data=False))
         if self._policy:
             if self.republished:
@@ -228,7 +237,7 @@ class Robot(SpunNode):
             if time.monotonic() > end:
                 raise NoMotionError(f"the robot did not move within {patience_s:g} s")
             if not self._relayed:
-                self._arm()
+                self.arm(PATIENCE_S)
             self.until(lambda: self.moves, min(MOTION_S, patience_s))
         self.until(lambda: False, 0.5 + phase_s)
         if not self.moves or time.monotonic() - self.heard[-1][0] > RECENT_S:
@@ -236,20 +245,22 @@ class Robot(SpunNode):
                 "the robot stood still when the fault was to be injected"
             )
 
-    def _arm(self) -> None:
+    def arm(self, patience_s: float) -> None:
+        """Reset the gate, and ask it to arm until it does. Raises NoMotionError."""
         self.call("reset")
-
-        def is_armed() -> bool:
+        deadline_s = time.monotonic() + patience_s
+        answer = self.call("arm")
+        while not answer.success:
+            if time.monotonic() > deadline_s:
+                raise NoMotionError(
+                    f"the gate did not arm within {patience_s:g} s: {answer.message}"
+                )
             self.until(lambda: False, PERIOD_S)
-            return bool(self.call("arm").success)
-
-        if not self.until(is_armed, PATIENCE_S):
-            raise NoMotionError(
-                f"the gate did not arm within {PATIENCE_S:g} s: {self.call('arm').message}"
-            )
+            answer = self.call("arm")
 
     def close(self) -> None:
         """Leave the graph."""
         super().close()
-        self._base.terminate()
-        self._base.join()
+        if self._base.is_alive():
+            self._base.terminate()
+            self._base.join()

@@ -47,6 +47,15 @@ def compute_odom_in_map(in_map: ArrayLike, in_odom: ArrayLike) -> Array:
     return geometry.compose(in_map, geometry.between(in_odom, np.zeros(3)))
 
 
+def find_transforms(node: Node, lacking: str) -> Any | None:
+    """Return the class of the messages on `/tf`; None, with a warning of what is lacking then."""
+    kind = conversions.transforms_type()
+    if kind is None:
+        reason = f"the package tf2_msgs is not installed, so {lacking} not published"
+        node.get_logger().warning(f"{reason}; {explain_install('tf2_msgs')}.")
+    return kind
+
+
 class MapToOdom:
     """Publishes map -> odom, stamped ahead by a tolerance [s] like AMCL's, so that it stays valid.
 
@@ -59,12 +68,8 @@ class MapToOdom:
         self._own: deque[Any] = deque(maxlen=KEPT)  # transforms
         self._frames = ("", "")
         self._heard_s = -math.inf
-        self._kind: Any = conversions.transforms_type()
+        self._kind: Any = find_transforms(node, "map -> odom is")
         if self._kind is None:
-            reason = (
-                "the package tf2_msgs is not installed, so map -> odom is not published"
-            )
-            node.get_logger().warning(f"{reason}; {explain_install('tf2_msgs')}.")
             return
         self._publisher = node.create_publisher(self._kind, "/tf", qos.TRANSFORMS)
         self._subscription = node.create_subscription(

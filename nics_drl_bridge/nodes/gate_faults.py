@@ -6,6 +6,8 @@ good datum before the fault, or from the fault itself if it is an event, until a
 `cmd_vel`.
 """
 
+from __future__ import annotations
+
 import itertools
 import math
 import os
@@ -13,7 +15,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,19 +46,12 @@ LATE_S = 0.40
 FROZEN_S = 0.5
 WATCHED_S = 0.8  # after a fault's limit
 LOG_CHARACTERS = 500
+GATE = "command_gate"
+POLICY = "policy_node"
 MAX_IDLE = 3  # attempts in a row to inject a fault into a robot that moves
 
 
-@dataclass(frozen=True)
-class Around:
-    """What an injection can affect: the robot, and the processes of policy and gate."""
-
-    robot: Robot
-    policy: NodeProcess | None
-    gate: NodeProcess | None
-
-
-Injection = Callable[[Around], object]
+Injection = Callable[["Surroundings"], object]
 # Returns what is sent instead of a message, from it, the last one before the fault, and its number.
 Change = Callable[[Any, Any, int], Any]
 
@@ -89,12 +84,10 @@ class Setup:
 
     model: str
     limits: str
-    twist: Array  # (3,) commanded to the robot, unless the policy does
-    low: Array  # (3,) limits of `cmd_vel`
-    high: Array
-    folder: (
-        Path  # for logs; each process has a subfolder named after its first injection
-    )
+    # for logs; each process has a subfolder named after its first injection
+    folder: Path
+    # (3,) commanded to the robot, unless the policy does; None: at half its limits
+    twist: Array | None = None
     policy: str = ""  # by default that of `policy_node`
     goal: tuple[float, float] = (1e6, 0.0)  # of the policy [m]
     gated: bool = True  # False: commands bypass the gate
@@ -109,7 +102,7 @@ def _silence(*topics: str) -> Injection:
 def _change(topic: str, change: Change) -> Injection:
     """Change each subsequent message of a topic."""
 
-    def inject(around: Around) -> None:
+    def inject(around: Surroundings) -> None:
         held = around.robot.last.get(topic)
         numbers = itertools.count(1)
         around.robot.change[topic] = lambda message: change(
@@ -150,7 +143,7 @@ def _freeze(topic: str, stamped: bool = False) -> Injection:
     return _change(topic, change)
 
 
-def _alternate_scans(around: Around) -> None:
+def _alternate_scans(around: Surroundings) -> None:
     """Alternate between two scans, like a driver that swaps two buffers."""
     shown = [around.robot.last["scan"].ranges]
 
@@ -197,26 +190,25 @@ def _jump(seconds: int) -> Injection:
 def _signal(how: signal.Signals, republished: bool = False) -> Injection:
     """Send the policy a signal; its last command may be republished."""
 
-    def inject(around: Around) -> None:
-        if around.policy is not None:
-            os.kill(around.policy.pid, how)
-            around.robot.republished = republished
+    def inject(around: Surroundings) -> None:
+        os.kill(around.processes[POLICY].pid, how)
+        around.robot.republished = republished
 
     return inject
 
 
-def _freeze_gate(around: Around) -> None:
+def _freeze_gate(around: Surroundings) -> None:
     """Freeze the gate itself for a while.
 
     Commands that it wrote before do not count, although the middleware, which freezes with it, may
     send the last one only afterwards.
     """
-    if around.gate is not None:
-        os.kill(around.gate.pid, signal.SIGSTOP)
-        around.robot.until(lambda: False, FROZEN_S)
-        around.robot.heard.clear()
-        around.robot.since_ns = time.time_ns()
-        os.kill(around.gate.pid, signal.SIGCONT)
+    pid = around.processes[GATE].pid
+    os.kill(pid, signal.SIGSTOP)
+    around.robot.until(lambda: False, FROZEN_S)
+    around.robot.heard.clear()
+    around.robot.since_ns = time.time_ns()
+    os.kill(pid, signal.SIGCONT)
 
 
 FAULTS: dict[str, Fault] = {
@@ -273,27 +265,8 @@ FAULTS: dict[str, Fault] = {
 }
 
 
-def inject(setup: Setup, around: Around, name: str, number: int) -> Injected:
-    """Drive, inject a fault with a variant and a phase drawn from a number, and watch the gate."""
-    fault = FAULTS[name]
-    robot = around.robot
-    ways = [fault.inject] if callable(fault.inject) else fault.inject
-    phase_s = np.random.default_rng(number).uniform(0.0, PERIOD_S)
-    robot.drive(setup.patience_s, phase_s)
-    robot.heard.clear()
-    broken_s = time.monotonic()
-    with suppress(TimeoutError):  # without an answer, what was heard decides
-        ways[number % len(ways)](around)
-    robot.until(lambda: False, fault.limit_s + WATCHED_S)
-    good_s = broken_s
-    if fault.since:
-        good_s = min(robot.sent_s[fault.since], broken_s)
-    stopped_s, unsafe = judge_commands(fault, robot.heard, good_s, broken_s)
-    if around.gate is not None and around.gate.poll() is not None:
-        stopped_s = math.inf  # a fault must not end the gate
-    for _, twist in robot.heard:
-        unsafe += not ((twist >= setup.low) & (twist <= setup.high)).all()
-    return Injected(stopped_s - good_s, stopped_s - broken_s, int(unsafe))
+# faults that only the gate reacts to, to show that an injection can fail
+CONTROLS = ("scan_silent", "odom_silent", "nan_scan", "command_nan")
 
 
 def judge_commands(
@@ -314,119 +287,6 @@ def judge_commands(
     return stopped_s, len(late_s)
 
 
-class Surroundings(ExitStack):
-    """A robot and the processes around it, which are restarted when they have ended."""
-
-    def __init__(self, setup: Setup, name: str, tell: Callable[[str], None]) -> None:
-        super().__init__()
-        self._setup = setup
-        self._name = name
-        self._tell = tell
-        self._domain_id = free_domain_id()
-        self._needs_policy = FAULTS[name].policy
-        self._gates = self.enter_context(ExitStack())
-        self._gate: NodeProcess | None = None
-        self._robot = Robot(
-            self._domain_id,
-            open_model(setup.model),
-            setup.twist,
-            self._needs_policy,
-            relayed=not setup.gated,
-        )
-        self.callback(self._robot.close)
-        self._policies = self.enter_context(ExitStack())
-        self._policy: NodeProcess | None = None
-
-    def prepare(self, folder: Path) -> Around:
-        """Start missing processes, with their logs in a folder; return what can be affected."""
-        if self._setup.gated and not _is_alive(self._gate):
-            if self._gate is not None:
-                self._tell(f"{self._name}: the gate has ended, and another is started")
-            self._gates.close()
-            gate = _start_gate(self._setup, folder, self._domain_id)
-            self._gate = self._gates.enter_context(gate)
-        if self._needs_policy and not _is_alive(self._policy):
-            self._policies.close()
-            policy = _start_policy(self._setup, folder, self._domain_id)
-            self._policy = self._policies.enter_context(policy)
-        return Around(self._robot, self._policy, self._gate)
-
-    def give_up_policy(self, error: Exception) -> None:
-        """Have another policy started: a killed one may leave DDS in a bad state."""
-        self._tell(f"{self._name}: {error}. {_read_log(self._policy)}")
-        self._policy = None
-
-    def __exit__(self, *details: Any) -> bool | None:
-        _is_alive(self._policy)  # one that is stopped would not end
-        return super().__exit__(*details)
-
-
-def inject_all(
-    setup: Setup, name: str, numbers: Sequence[int], tell: Callable[[str], None]
-) -> Iterator[Injected]:
-    """Yield an injection of a fault for each number; fewer if the robot does not move.
-
-    `tell` gets a line if an attempt fails. A policy or a gate that has ended is restarted.
-    """
-    with Surroundings(setup, name, tell) as surroundings:
-        for number in numbers:
-            for attempt in range(MAX_IDLE):
-                named = f"{number}_{attempt}" if attempt else f"{number}"
-                try:
-                    around = surroundings.prepare(setup.folder / named)
-                    injected = inject(setup, around, name, number)
-                except (NoMotionError, TimeoutError) as error:  # nothing was injected
-                    surroundings.give_up_policy(error)
-                else:
-                    yield injected
-                    break
-            else:
-                return
-
-
-def _start_policy(setup: Setup, folder: Path, domain_id: int) -> NodeProcess:
-    parameters: dict[str, Any] = {"model": setup.model, "goal": [*setup.goal]}
-    if setup.policy:
-        parameters["policy"] = setup.policy
-    return NodeProcess("policy_node", folder, parameters, domain_id)
-
-
-def _start_gate(setup: Setup, folder: Path, domain_id: int) -> NodeProcess:
-    parameters = {
-        "model": setup.model,
-        "limits": setup.limits,
-        "e_stop_required": True,
-        "black_box": str(folder / "black_box"),
-        "enable_stamped_cmd_vel": False,
-        "stop_when_held": False,  # the robot's scans do not show how it moves
-        **setup.parameters,
-    }
-    return NodeProcess("command_gate", folder, parameters, domain_id)
-
-
-def _is_alive(process: NodeProcess | None) -> bool:
-    """Continue a process that was stopped; return False if it has ended."""
-    if process is None:
-        return False
-    try:
-        os.kill(process.pid, signal.SIGCONT)
-        process.check()
-    except (BackendError, ProcessLookupError):
-        return False
-    return True
-
-
-def _read_log(policy: NodeProcess | None) -> str:
-    if policy is None:
-        return ""
-    text = policy.log.read_text(encoding="utf-8", errors="replace")
-    return f"Another policy is started: {text[-LOG_CHARACTERS:]}"
-
-
-# faults that only the gate reacts to, to show that an injection can fail
-CONTROLS = ("scan_silent", "odom_silent", "nan_scan", "command_nan")
-
-
 def find_reach(robot: RobotSpec, limits: Limits) -> tuple[Array, Array]:
     """Return the minimum and the maximum `cmd_vel` (3,) within limits.
 
@@ -437,42 +297,140 @@ def find_reach(robot: RobotSpec, limits: Limits) -> tuple[Array, Array]:
     return twists.min(axis=0), twists.max(axis=0)
 
 
+class Surroundings(ExitStack):
+    """A robot and the processes around it, into which a fault is injected."""
+
+    def __init__(self, setup: Setup, name: str, tell: Callable[[str], None]) -> None:
+        super().__init__()
+        self._setup = setup
+        self._name = name
+        self._tell = tell
+        self._fault = FAULTS[name]
+        self._domain_id = free_domain_id()
+        model = open_model(setup.model)
+        limits = load_limits(setup.limits, model.robot)
+        self._low, self._high = find_reach(model.robot, limits)
+        twist = setup.twist
+        if twist is None:
+            command = 0.1 * np.where(limits.high > 0.0, limits.high, limits.low)
+            command[0] *= 5.0
+            twist = model.robot.to_cmd_vel(command)
+        self.processes: dict[str, NodeProcess] = {}
+        has_policy = self._fault.policy
+        self.robot: Robot = Robot(
+            self._domain_id, model, twist, has_policy, relayed=not setup.gated
+        )
+        self.callback(self.robot.close)
+
+    def start_missing(self, folder: Path) -> None:
+        """Start the processes that are needed and do not run, with their logs in a folder."""
+        setup = self._setup
+        needed: dict[str, dict[str, Any]] = {}
+        if setup.gated:
+            needed[GATE] = {
+                "limits": setup.limits,
+                "e_stop_required": True,
+                "black_box": str(folder / "black_box"),
+                "enable_stamped_cmd_vel": False,
+                "stop_when_held": False,  # the robot's scans do not show how it moves
+                **setup.parameters,
+            }
+        if self._fault.policy:
+            needed[POLICY] = {"goal": [*setup.goal]}
+            if setup.policy:
+                needed[POLICY]["policy"] = setup.policy
+        for node, parameters in needed.items():
+            process = self.processes.get(node)
+            if process is not None and _is_alive(process):
+                continue
+            if process is not None and node == GATE:
+                self._tell(f"{self._name}: the gate has ended, and another is started")
+            values = {"model": setup.model, **parameters}
+            process = NodeProcess(node, folder, values, self._domain_id)
+            self.processes[node] = self.enter_context(process)
+            self.callback(_is_alive, process)  # one that is stopped would not end
+
+    def inject(self, number: int) -> Injected:
+        """Drive, inject a fault with a variant and a phase drawn from a number, and watch."""
+        fault = self._fault
+        robot = self.robot
+        ways = [fault.inject] if callable(fault.inject) else fault.inject
+        phase_s = np.random.default_rng(number).uniform(0.0, PERIOD_S)
+        robot.drive(self._setup.patience_s, phase_s)
+        robot.heard.clear()
+        broken_s = time.monotonic()
+        with suppress(TimeoutError):  # without an answer, what was heard decides
+            ways[number % len(ways)](self)
+        robot.until(lambda: False, fault.limit_s + WATCHED_S)
+        good_s = broken_s
+        if fault.since:
+            good_s = min(robot.sent_s[fault.since], broken_s)
+        stopped_s, unsafe = judge_commands(fault, robot.heard, good_s, broken_s)
+        if self._setup.gated and self.processes[GATE].poll() is not None:
+            stopped_s = math.inf  # a fault must not end the gate
+        for _, twist in robot.heard:
+            unsafe += not ((twist >= self._low) & (twist <= self._high)).all()
+        return Injected(stopped_s - good_s, stopped_s - broken_s, int(unsafe))
+
+    def give_up(self, error: Exception) -> None:
+        """Tell why nothing was injected; end a policy, since a killed one may leave DDS amiss."""
+        line = f"{self._name}: {error}."
+        policy = self.processes.pop(POLICY, None)
+        if policy is not None:
+            _is_alive(policy)
+            policy.close()
+            text = policy.log.read_text(encoding="utf-8", errors="replace")
+            line = f"{line} Another policy is started: {text[-LOG_CHARACTERS:]}"
+        self._tell(line)
+
+
+def _is_alive(process: NodeProcess) -> bool:
+    """Continue a process that was stopped; return False if it has ended."""
+    try:
+        os.kill(process.pid, signal.SIGCONT)
+        process.check()
+    except (BackendError, ProcessLookupError):
+        return False
+    return True
+
+
+def inject_all(
+    setup: Setup, name: str, numbers: Sequence[int], tell: Callable[[str], None]
+) -> Iterator[Injected]:
+    """Yield an injection of a fault for each number; fewer if the robot does not move.
+
+    `tell` gets a line if an attempt fails. A policy or a gate that has ended is restarted.
+    """
+    with Surroundings(setup, name, tell) as around:
+        for number in numbers:
+            for attempt in range(MAX_IDLE):
+                named = f"{number}_{attempt}" if attempt else f"{number}"
+                try:
+                    around.start_missing(setup.folder / named)
+                    injected = around.inject(number)
+                except (NoMotionError, TimeoutError) as error:  # nothing was injected
+                    around.give_up(error)
+                else:
+                    yield injected
+                    break
+            else:
+                return
+
+
 def inject_trials(
     protocol: Protocol, folder: Path, tell: Callable[[str], None], trials: list[Trial]
 ) -> Iterator[Row]:
     """Yield a row for each trial whose fault was injected."""
-    setup = choose_setup(protocol, folder)
     kinds = itertools.groupby(trials, lambda trial: (trial.kind, trial.gated))
     for (name, gated), group in kinds:
-        own = folder / (name if gated else f"{name}_no_gate")
-        around = replace(setup, gated=gated, folder=own)
-        yield from _inject_kind(around, name, list(group), tell)
-
-
-def _inject_kind(
-    setup: Setup, name: str, trials: list[Trial], tell: Callable[[str], None]
-) -> Iterator[Row]:
-    limit_s = FAULTS[name].limit_s
-    injections = inject_all(setup, name, [trial.seed for trial in trials], tell)
-    for trial, injected in zip(trials, injections, strict=False):
-        in_time = injected.time_s <= limit_s and not injected.unsafe
-        verdict = {"fault": True, "limit_s": limit_s, "in_time": in_time}
-        yield trial._asdict() | verdict | asdict(injected)
-
-
-def choose_setup(protocol: Protocol, folder: Path) -> Setup:
-    """Return a gate, and a robot that is commanded to move at half its limits."""
-    robot = open_model(protocol.model).robot
-    limits = load_limits(protocol.limits, robot)
-    command = 0.1 * np.where(limits.high > 0.0, limits.high, limits.low)
-    command[0] *= 5.0
-    low, high = find_reach(robot, limits)
-    return Setup(
-        model=protocol.model,
-        limits=protocol.limits,
-        twist=robot.to_cmd_vel(command),
-        low=low,
-        high=high,
-        folder=folder,
-        policy=protocol.policy,
-    )
+        logs = folder / (name if gated else f"{name}_no_gate")
+        setup = Setup(
+            protocol.model, protocol.limits, logs, policy=protocol.policy, gated=gated
+        )
+        alike = list(group)
+        limit_s = FAULTS[name].limit_s
+        injections = inject_all(setup, name, [trial.seed for trial in alike], tell)
+        for trial, injected in zip(alike, injections, strict=False):
+            in_time = injected.time_s <= limit_s and not injected.unsafe
+            verdict = {"fault": True, "limit_s": limit_s, "in_time": in_time}
+            yield trial._asdict() | verdict | asdict(injected)

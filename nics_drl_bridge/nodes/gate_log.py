@@ -18,7 +18,7 @@ from nics_drl_bridge.gate.state import Cause, GateConfig, GateState
 from nics_drl_bridge.nodes import black_box_writer
 from nics_drl_bridge.nodes.black_box_writer import FILES_KEPT
 from nics_drl_bridge.nodes.listener import holds
-from nics_drl_bridge.nodes.node_process import make_module_command
+from nics_drl_bridge.nodes.processes import make_module_command
 from nics_drl_bridge.nodes.runner import ERROR, OK, STALE, WARN, Condition
 
 BURST_S = (
@@ -180,14 +180,11 @@ class BlackBox:
         segments[-1].lines.append(line)
         segments[-1].size += len(line)
         while len(segments) > 1 and (
-            segments[1].begin_s <= entry.now - KEPT_S or self._is_full()
+            segments[1].begin_s <= entry.now - KEPT_S
+            or sum(len(segment.lines) for segment in segments) > MOST_LINES
+            or sum(segment.size for segment in segments) > MOST_BYTES
         ):
             segments.popleft()
-
-    def _is_full(self) -> bool:
-        lines = sum(len(segment.lines) for segment in self._segments)
-        size = sum(segment.size for segment in self._segments)
-        return lines > MOST_LINES or size > MOST_BYTES
 
     def lines(self) -> list[bytes]:
         """Return the lines for a file: the oldest state, and all entries since."""

@@ -1,8 +1,7 @@
 """Launch descriptions of the launches in `starting`, for the files in `launch/` and your own.
 
-Your own launch file can take a whole launch, as in `describe(whole_simulation())`, or combine parts
-and arguments of `starting`, as in `describe(Launch("...", [bridge], [*common("false"),
-*of_bridge()]))`.
+Your own launch file can take a whole launch, as in `describe(LAUNCHES["vehicle"])`, or combine
+parts of `starting`, as in `describe(Launch("...", [simulator, bridge], {"use_sim_time": "true"}))`.
 """
 
 from typing import Any

@@ -419,7 +419,11 @@ class EpisodeServices:
         # The middleware drops answers to clients that the simulator has not discovered yet, and a
         # second reset would begin another episode. A simulator that answers the client that was
         # made last knows the others, too.
-        self._require_same(self._read_facts(timeout_s))
+        facts = self._read_facts(timeout_s)
+        for key, mine in self._identity.items():
+            if facts.get(key) != mine:
+                runs = f"the simulator runs the {key} {facts.get(key)!r}, this env {mine!r}"
+                raise ModelError(f"{runs}; start both with the same {key}.")
         result = self._link.call(self._parameters, request, timeout_s).result
         if not result.successful:
             raise BackendError(f"the simulator refused the episode: {result.reason}")
@@ -432,12 +436,6 @@ class EpisodeServices:
         """Return what the simulator tells about itself; asking again does no harm."""
         tested = self._link.call(self._test, SelfTest.Request(), timeout_s, LOST_S)
         return {pair.key: pair.value for pair in tested.status[0].values}
-
-    def _require_same(self, facts: Mapping[str, str]) -> None:
-        for key, mine in self._identity.items():
-            if facts.get(key) != mine:
-                runs = f"the simulator runs the {key} {facts.get(key)!r}, this env {mine!r}"
-                raise ModelError(f"{runs}; start both with the same {key}.")
 
 
 T = TypeVar("T")

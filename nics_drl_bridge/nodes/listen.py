@@ -1,7 +1,6 @@
 """Facts about a live robot, collected by listening, for `report.doctor`."""
 
 import time
-from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -56,7 +55,18 @@ def listen(
 
 def _look(node: Node, facts: Facts, subscribed: set[str], imu: str) -> None:
     for topic, kinds in node.get_topic_names_and_types():
-        facts.topics[topic] = _find_endpoints(node, topic, kinds)
+        publishers = node.get_publishers_info_by_topic(topic)
+        subscribers = node.get_subscriptions_info_by_topic(topic)
+        offered = {info.topic_type for info in publishers} or set(kinds)
+        facts.topics[topic] = Endpoints(
+            tuple(sorted(offered)),
+            tuple(make_offer(info.qos_profile) for info in publishers),
+            tuple(
+                make_offer(info.qos_profile)
+                for info in subscribers
+                if info.node_name != NAME
+            ),
+        )
     if GYRO in facts.names and GYRO not in subscribed:
         types = {
             topic: ends.types for topic, ends in facts.topics.items() if ends.offers
@@ -70,22 +80,6 @@ def _look(node: Node, facts: Facts, subscribed: set[str], imu: str) -> None:
             kind = find_message_type(wanted[0])
             take = partial(_take, facts, role)
             node.create_subscription(kind, topic, take, ANY_PUBLISHER)
-
-
-def _find_endpoints(node: Node, topic: str, kinds: Iterable[str]) -> Endpoints:
-    """Return who publishes a topic, and who else subscribes to it."""
-    publishers = node.get_publishers_info_by_topic(topic)
-    subscribers = node.get_subscriptions_info_by_topic(topic)
-    offered = {info.topic_type for info in publishers} or set(kinds)
-    return Endpoints(
-        tuple(sorted(offered)),
-        tuple(make_offer(info.qos_profile) for info in publishers),
-        tuple(
-            make_offer(info.qos_profile)
-            for info in subscribers
-            if info.node_name != NAME
-        ),
-    )
 
 
 def _take(facts: Facts, role: str, message: Any, info: Any) -> None:

@@ -1,7 +1,9 @@
 """Message packages that are missing from the ROS 2 wheels, and how to install them."""
 
+import sys
 from collections.abc import Mapping
-from importlib.metadata import distributions
+from functools import cache
+from importlib.metadata import PathDistribution
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,12 +17,14 @@ class Wheels(NamedTuple):
     versions: Mapping[str, str]  # by name
 
 
+@cache
 def find_wheels() -> Wheels | None:
     """Return the installed wheels of ROS 2; None if ROS 2 is missing or installed otherwise."""
     versions = {}
-    for package in distributions():
-        name = str(package.metadata["Name"] or "").lower().replace("_", "-")
-        if name.startswith("ros-"):
+    for folder in sys.path:
+        for file in Path(folder).glob("ros[-_]*.dist-info"):
+            package = PathDistribution(file)
+            name = str(package.metadata["Name"]).lower().replace("_", "-")
             versions[name] = package.version
     for name in versions:
         if name.endswith("-rclpy"):

@@ -13,7 +13,7 @@ from nics_drl_bridge.middleware.measurement import Health, Rejection
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.frames import MapToOdom, compute_odom_in_map
-from nics_drl_bridge.nodes.parameters import BASE_FRAME, MAP_FRAME, list_middleware_rows
+from nics_drl_bridge.nodes.parameters import BASE_FRAME, MAP_FRAME
 from nics_drl_bridge.nodes.robot_topics import SILENCE_S, RobotTopics
 from nics_drl_bridge.nodes.runner import (
     ACTIVE,
@@ -29,7 +29,7 @@ class MiddlewareNode(ManagedNode):
     """Listens to a robot's topics; publishes `odometry/filtered` and `/diagnostics`."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("middleware_node", list_middleware_rows(), **options)
+        super().__init__("middleware_node", "middleware", **options)
         self._rejected: dict[Rejection, int] = {}  # counts at the last look
         runner.serve(self, "~/reset", self._reset)
         runner.diagnose(self, "topics", self._look)
@@ -58,8 +58,8 @@ class MiddlewareNode(ManagedNode):
         # a pose or a yaw rate may be newer
         stamp_ns = max(stamp_ns, estimator.time_ns)
         view = self._topics.middleware.view(stamp_ns)
-        map_frame = runner.get_text(self, MAP_FRAME.name)
-        base_frame = runner.get_text(self, BASE_FRAME.name)
+        map_frame = runner.get_text(self, MAP_FRAME)
+        base_frame = runner.get_text(self, BASE_FRAME)
         message = conversions.odometry_to_ros(
             view.pose, view.twist, stamp_ns, (map_frame, base_frame), (0.0,) * 4
         )

@@ -5,14 +5,18 @@ It imports no simulator and no kernels: an emergency stop must not wait for seco
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.srv import SelfTest
 from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import Header
@@ -22,17 +26,22 @@ from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.goal_answer import GoalAnswer, answer_from_values
-from nics_drl_bridge.nodes.listener import Listener, holds
+from nics_drl_bridge.nodes.listener import Listener, ask, holds
+from nics_drl_bridge.recording.messages import read_whole_pose
 
 GATE = "command_gate"
 POLICY = ": policy"  # how the name of a policy node's status ends
-POLL_S = 0.02
+POLL_S = 0.01
+REPLY_S = 2.0  # longest wait for one answer before asking a simulator again [s]
 ASK_AGAIN_S = 1.0  # between two requests that are refused [s]
 GATE_ANSWER_S = 5.0  # that a gate may take to answer [s]
 CALL_S = 10.0  # the same with the time to find its service [s]
 SETTLE_S = 1.0  # in which all gates are seen, once one of them is [s]
 Tell = Callable[[str], None]
+# keys of a policy node's diagnostics
+STAMP = "stamp of the newest goal [ns]"
+TAKEN = "newest goal taken"
+TOLD = "newest goal"
 
 
 class TriggerAnswer(NamedTuple):
@@ -41,6 +50,27 @@ class TriggerAnswer(NamedTuple):
     node: str  # its name
     granted: bool
     told: str
+
+
+@dataclass(frozen=True)
+class GoalAnswer:
+    """The answer to a goal: accepted or refused."""
+
+    stamp_ns: int  # of the goal's message
+    granted: bool
+    told: str  # where the goal is, or why it was refused
+
+    def to_facts(self) -> dict[str, object]:
+        """Return the answer as facts of a node's diagnostics."""
+        return {STAMP: self.stamp_ns, TAKEN: self.granted, TOLD: self.told}
+
+
+def answer_from_values(values: Mapping[str, str]) -> GoalAnswer | None:
+    """Return the answer among the values of a node's diagnostics, or None."""
+    stamp = values.get(STAMP, "")
+    if not stamp.isdecimal():
+        return None
+    return GoalAnswer(int(stamp), values.get(TAKEN) == str(True), values.get(TOLD, ""))
 
 
 class GoalRequest(NamedTuple):
@@ -53,6 +83,7 @@ class GoalRequest(NamedTuple):
 
 
 Answer = TypeVar("Answer", TriggerAnswer, GoalAnswer)
+OperatorT = TypeVar("OperatorT", bound="Operator")
 
 
 def ask_until_granted(
@@ -104,17 +135,20 @@ def get_namespace_of(name: str) -> str:
     return name.rpartition("/")[0]
 
 
-class Operator(AbstractContextManager["Operator", None]):
+class Operator:
     """A node that calls gates and sends goals; a context manager. Raises BackendError."""
 
     def __init__(self, domain_id: int | None = None) -> None:
         # policy node -> its condition, and the values of its diagnostics; written by the thread
         self._policies: dict[str, tuple[str, dict[str, str]]] = {}
         self._node = Listener("nics_operator", domain_id)
+        self._subscribe()
+        self._node.start()
+
+    def _subscribe(self) -> None:
         self._node.create_subscription(
             DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS
         )
-        self._node.start()
 
     def arm(
         self, namespace: str, seconds: float, reset: bool, tell: Tell
@@ -259,5 +293,50 @@ class Operator(AbstractContextManager["Operator", None]):
                     values,
                 )
 
+    def __enter__(self: OperatorT) -> OperatorT:
+        return self
+
     def __exit__(self, *_: object) -> None:
         self._node.close()
+
+
+class Witness(Operator):
+    """An operator who also sees a simulated robot's true motion."""
+
+    def _subscribe(self) -> None:
+        super()._subscribe()
+        self._poses: list[tuple[float, float, float]] = []
+        self._node.create_subscription(
+            Odometry,
+            "ground_truth",
+            lambda message: self._poses.append(read_whole_pose(message)),
+            qos.SENSOR_RELIABLE,
+        )
+
+    @property
+    def path(self) -> NDArray[np.float64]:
+        """All poses so far (T, 3)."""
+        return np.array(self._poses).reshape(-1, 3)
+
+    def sees(self, timeout_s: float) -> bool:
+        """Wait for a first pose; return False after `timeout_s`."""
+        return holds(lambda: self._poses, timeout_s, POLL_S)
+
+    def arrives(self, goal: Sequence[float], radius: float, timeout_s: float) -> bool:
+        """Wait until the robot is within `radius` of a goal (2,); False after `timeout_s`."""
+
+        def is_there() -> bool:
+            return bool(self._poses) and math.dist(self._poses[-1][:2], goal) < radius
+
+        return holds(is_there, timeout_s, POLL_S)
+
+    def touched(self, simulator: str, timeout_s: float) -> bool:
+        """True if the simulated robot touched something in this episode. Raises BackendError."""
+        client = self._node.create_client(SelfTest, f"{simulator}/self_test")
+        wait = partial(holds, poll_s=POLL_S)
+        response = ask(client, SelfTest.Request(), timeout_s, wait, REPLY_S)
+        self._node.destroy_client(client)
+        if response is None:
+            reason = f"{simulator} did not answer within {timeout_s:g} s"
+            raise BackendError(f"the episode can't be judged: {reason}.")
+        return not any(response.passed)

@@ -20,11 +20,9 @@ from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.middleware.uncertainty import compute_uncertainty_gain
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.frames import GoalFrames
-from nics_drl_bridge.nodes.goal_answer import GoalAnswer
-from nics_drl_bridge.nodes.parameters import list_policy_rows
-from nics_drl_bridge.nodes.parts import Wish, open_parts
+from nics_drl_bridge.nodes.operator import GoalAnswer
 from nics_drl_bridge.nodes.robot_topics import SILENCE_S, RobotTopics
-from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED, ManagedNode
+from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED, ManagedNode, Wish
 from nics_drl_bridge.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.file.stateful import begin, resume
 from nics_drl_bridge.policy.policies import open_policy
@@ -38,8 +36,8 @@ class PolicyNode(ManagedNode):
     """Answers each scan with a `cmd_vel_raw` of the same stamp, until the goal is reached."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("policy_node", list_policy_rows(), **options)
-        self._leaders = open_parts("policy", self)
+        super().__init__("policy_node", "policy", **options)
+        self._leaders = runner.open_parts("policy", self)
         self._acted_ns = 0
         self._answer: GoalAnswer | None = None  # to the newest goal
         runner.diagnose(self, "policy", self._look)
@@ -52,7 +50,10 @@ class PolicyNode(ManagedNode):
         """Open model and policy, and subscribe."""
         model = self._model = open_model(runner.get_text(self, "model"))
         self._open_policy(model)
-        self._goal = self._read_goal()
+        goal = self._goal = np.array(self.get_parameter("goal").value, np.float64)
+        if len(goal) != 2 or not (abs(goal).max() <= 1e8 or np.isnan(goal).all()):
+            needed = "must be [x, y] within 1e8 m, or both NaN to wait for goal_pose"
+            raise ConfigError(f"parameter 'goal': {needed}, not {goal.tolist()}.")
         self._read_pace(model.control_period)
         self._acted_ns = 0
         self._answer = None
@@ -84,13 +85,6 @@ class PolicyNode(ManagedNode):
         self._due = runner.call_periodically(self, model.control_period, self._act)
         self._due.cancel()  # until a scan comes before an action is due
         self.undo.callback(self.destroy_timer, self._due)
-
-    def _read_goal(self) -> Array:
-        goal = np.array(self.get_parameter("goal").value, dtype=np.float64)
-        if len(goal) != 2 or not (abs(goal).max() <= 1e8 or np.isnan(goal).all()):
-            needed = "must be [x, y] within 1e8 m, or both NaN to wait for goal_pose"
-            raise ConfigError(f"parameter 'goal': {needed}, not {goal.tolist()}.")
-        return goal
 
     def _read_pace(self, period_s: float) -> None:
         names = ("rate", "deadline", "late_limit")

@@ -1,37 +1,24 @@
-"""Processes of the package's nodes with a reliable end, and a witness of what they do."""
+"""Processes of nodes with a reliable end, and domains for them; needs no ROS 2 itself."""
 
+import ctypes
 import os
 import random
-import time
-from collections.abc import Mapping
-from contextlib import AbstractContextManager
-from functools import partial
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import numpy as np
-from diagnostic_msgs.srv import SelfTest
-from nav_msgs.msg import Odometry
-from numpy.typing import ArrayLike, NDArray
-
-from nics_drl_bridge.config import PACKAGE
+from nics_drl_bridge.config import PACKAGE, dump_yaml
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.listener import (
-    GREATEST_DOMAIN_ID,
-    Listener,
-    ask,
-    holds,
-)
-from nics_drl_bridge.nodes.node_process import ChildProcess, make_command
-from nics_drl_bridge.nodes.operator import Call, TriggerAnswer, ask_until_granted
-from nics_drl_bridge.nodes.starting import NodeStart
-from nics_drl_bridge.nodes.transport import find_used_domains
+from nics_drl_bridge.nodes.starting import NodeStart, find_prefix
+from nics_drl_bridge.nodes.transport import GREATEST_DOMAIN_ID, find_used_domains
 
+PR_SET_PDEATHSIG = 1
+PATIENCE_S = 5.0  # time limit for a process to end [s]
 LAST_DOMAIN_ID = 101  # above it DDS ports may collide with Linux's ephemeral ports
 LOG_LINES = 5
-REPLY_S = 2.0  # longest wait for one answer before asking again [s]
-POLL_S = 0.005
 
 
 def free_domain_id() -> int:
@@ -57,6 +44,132 @@ def unused_domain_id() -> int:
     return random.SystemRandom().choice(sorted(unused) or every)
 
 
+def make_module_command(module: str) -> list[str]:
+    """Return the command that runs a module; its arguments may follow.
+
+    `python -m` looks for modules in the working folder first. That folder may hold arbitrary data,
+    such as a model with a file `json.py`. PYTHONSAFEPATH prevents this only since Python 3.11.
+    """
+    path = f"import sys; sys.path[:] = {sys.path!r}"
+    run = f"from runpy import run_module; run_module({module!r}, run_name='__main__')"
+    return [sys.executable, "-c", f"{path}; {run}"]
+
+
+def prepare_child() -> Callable[[], None]:
+    """Return what a child runs first: SIGINT ends it, and on Linux it ends with its parent.
+
+    Shells make background jobs ignore SIGINT, as in `make test &`, and children inherit this.
+    """
+    prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
+    parent = os.getpid()
+
+    def prepare() -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        if prctl is not None:
+            prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+            if os.getppid() != parent:  # the parent died in between
+                os._exit(1)
+
+    return prepare
+
+
+def make_command(node: NodeStart, folder: Path) -> list[str]:
+    """Return the command line of a node, and write its parameters to a file in a folder."""
+    place = f"/{node.namespace}/{node.executable}".replace("//", "/")
+    # In a parameter file, values for this very node take precedence over those for all nodes.
+    nodes = place if node.params_file else "/**"
+    file = folder / f"{place.strip('/').replace('/', '.')}.yaml"
+    parameters = {nodes: {"ros__parameters": dict(node.parameters)}}
+    file.write_text(dump_yaml(parameters, quote_text=True), encoding="utf-8")
+    words = [*find_program(node), *node.arguments, "--ros-args"]
+    if node.log_level:
+        words += ["--log-level", node.log_level]
+    rules = list(node.remappings)
+    if node.namespace:
+        rules.insert(0, ("__ns", f"/{node.namespace.strip('/')}"))
+    if not node.own:
+        rules.insert(0, ("__node", node.executable))
+    for old, new in rules:
+        words += ["-r", f"{old}:={new}"]
+    if node.params_file:
+        words += ["--params-file", node.params_file]
+    if node.parameters:
+        words += ["--params-file", str(file)]
+    return words
+
+
+def find_program(node: NodeStart) -> list[str]:
+    """Return the words that start a node's program. Raises ConfigError if it is missing."""
+    if node.own:
+        return [*make_module_command(f"{PACKAGE}.nodes.start"), node.executable]
+    prefix = find_prefix(node.package)
+    if prefix is None:
+        fix = "install it with your ROS 2 distribution, or start without it"
+        raise ConfigError(
+            f"the ROS 2 package {node.package!r} is not installed here; {fix}."
+        )
+    return [str(prefix / "lib" / node.package / node.executable)]
+
+
+ChildT = TypeVar("ChildT", bound="ChildProcess")
+
+
+class ChildProcess:
+    """A process that ends with `close`, and on Linux with its parent thread."""
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        log: Path | None = None,
+        **environment: str,
+    ) -> None:
+        """Start the process; its output goes to a file, or to the output of this process."""
+        self.name = name
+        # Import no modules from the working folder, which may be a model.
+        environment["PYTHONSAFEPATH"] = "1"
+        output = None if log is None else log.open("wb")
+        try:
+            # In its own session: Ctrl-C in the terminal reaches only the parent, which ends it.
+            self._process = subprocess.Popen(
+                command,
+                env={**os.environ, **environment},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,
+                preexec_fn=prepare_child(),
+            )
+        finally:
+            if output is not None:
+                output.close()
+        self.pid = self._process.pid
+
+    def poll(self) -> int | None:
+        """Return the exit code, or None while the process runs."""
+        return self._process.poll()
+
+    def interrupt(self) -> None:
+        """Ask the process to end, like Ctrl-C."""
+        if self.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+
+    def close(self) -> int:
+        """End the process by SIGINT, or SIGKILL if it does not react; return its exit code."""
+        self.interrupt()
+        try:
+            return self._process.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+        return self._process.wait()
+
+    def __enter__(self: ChildT) -> ChildT:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
 class NodeProcess(ChildProcess):
     """One of the package's nodes in its own process, with its output in a file."""
 
@@ -77,82 +190,21 @@ class NodeProcess(ChildProcess):
         start = NodeStart(
             PACKAGE, node, namespace.strip("/"), parameters, remappings=rules
         )
-        chosen = {
-            "ROS_DOMAIN_ID": str(domain_id),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": discovery,
-        }
-        super().__init__(node, make_command(start, folder), chosen, self.log)
+        super().__init__(
+            node,
+            make_command(start, folder),
+            self.log,
+            ROS_DOMAIN_ID=str(domain_id),
+            ROS_AUTOMATIC_DISCOVERY_RANGE=discovery,
+        )
 
     def check(self) -> None:
         """Raise BackendError with the end of its log if the node has ended by itself."""
         code = self.poll()
         if code is not None:
-            lines = (
-                self.log.read_text(encoding="utf-8", errors="replace")
-                .strip()
-                .splitlines()
-            )
+            text = self.log.read_text(encoding="utf-8", errors="replace")
+            lines = text.strip().splitlines()
             shown = [line for line in lines if not line.startswith("[INFO]")] or lines
             last = " | ".join(shown[-LOG_LINES:]) or "no output"
             reason = f"ended with code {code}: {last} (its log is {self.log})."
             raise BackendError(f"{self.node} {reason}")
-
-
-class Witness(AbstractContextManager["Witness", None]):
-    """Context manager that observes a simulated robot's true motion in its own thread."""
-
-    def __init__(self, domain_id: int | None = None) -> None:
-        self._poses: list[NDArray[np.float64]] = []
-        self._node = Listener("witness", domain_id)
-        self._node.create_subscription(
-            Odometry, "ground_truth", self._take, qos.SENSOR_RELIABLE
-        )
-        self._node.start()
-
-    def _take(self, message: Odometry) -> None:
-        self._poses.append(conversions.odometry_from_ros(message)[0])
-
-    @property
-    def path(self) -> NDArray[np.float64]:
-        """All poses so far (T, 3)."""
-        return np.array(self._poses).reshape(-1, 3)
-
-    def sees(self, timeout_s: float) -> bool:
-        """Wait for a first pose; return False after `timeout_s`."""
-        return holds(lambda: self._poses, timeout_s, POLL_S)
-
-    def arrives(self, goal: ArrayLike, radius: float, timeout_s: float) -> bool:
-        """Wait until the robot is within `radius` of a goal (2,); False after `timeout_s`."""
-
-        def there() -> bool:
-            newest = self._poses[-1:]
-            return any(
-                np.linalg.norm(pose[:2] - np.asarray(goal)) < radius for pose in newest
-            )
-
-        return holds(there, timeout_s, POLL_S)
-
-    def arms(self, gate: str, timeout_s: float) -> str:
-        """Ask a gate to arm until it agrees; return its last reason for refusing, or ''."""
-
-        def arm() -> TriggerAnswer:
-            return Call(self._node, gate, "arm").wait_for_answer(REPLY_S)
-
-        answer = ask_until_granted(
-            arm, time.monotonic() + timeout_s, lambda _: None, gate
-        )
-        return "" if answer.granted else answer.told
-
-    def touched(self, simulator: str, timeout_s: float) -> bool:
-        """True if the simulated robot touched something in this episode. Raises BackendError."""
-        client = self._node.create_client(SelfTest, f"{simulator}/self_test")
-        wait = partial(holds, poll_s=POLL_S)
-        response = ask(client, SelfTest.Request(), timeout_s, wait, REPLY_S)
-        self._node.destroy_client(client)
-        if response is None:
-            reason = f"{simulator} did not answer within {timeout_s:g} s"
-            raise BackendError(f"the episode can't be judged: {reason}.")
-        return not any(response.passed)
-
-    def __exit__(self, *_: object) -> None:
-        self._node.close()

@@ -8,7 +8,7 @@ newest view. The executor's thread feeds the topics into the middleware in the m
 import math
 import time
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from pydantic import Field, PositiveFloat, model_validator
 
@@ -93,13 +93,6 @@ class RealtimeOptions(Schema):
     def gated(self) -> bool:
         """True if commands pass a `command_gate`."""
         return self.command_topic.rsplit("/", 1)[-1] == inputs.RAW
-
-
-class Hindrance(NamedTuple):
-    """What keeps a robot from beginning an episode."""
-
-    reason: str
-    fix: str
 
 
 class RealtimeBackend:
@@ -303,37 +296,34 @@ class RealtimeBackend:
             hindrance = self._find_hindrance(start)
             if hindrance is None:
                 return
+            reason, fix = hindrance
             now = time.monotonic()
             if now > deadline:
-                reason = (
-                    f"after {timeout_s:g} s the robot is not ready: {hindrance.reason}"
+                raise BackendError(
+                    f"after {timeout_s:g} s the robot is not ready: {reason}; {fix}."
                 )
-                raise BackendError(f"{reason}; {hindrance.fix}.")
             if now >= next_report:
-                say(f"waiting for the robot: {hindrance.reason}")
+                say(f"waiting for the robot: {reason}")
                 next_report = now + SAY_EVERY_S
             time.sleep(POLL_S)
 
-    def _find_hindrance(self, start: Start | None) -> Hindrance | None:
-        """Return what keeps the robot from beginning at `start`, or anywhere if None."""
+    def _find_hindrance(self, start: Start | None) -> tuple[str, str] | None:
+        """Return what keeps the robot from beginning at `start`, or anywhere if None, and a fix."""
         silences_s = self._measure_silences()
         topic = max(silences_s, key=lambda topic: silences_s[topic])
         fix = "check that its publisher runs in this ROS domain and namespace"
         if math.isinf(silences_s[topic]):
-            return Hindrance(f"no {topic} yet", fix)
+            return f"no {topic} yet", fix
         if silences_s[topic] > self._options.stale_after_s:
-            return Hindrance(f"no {topic} for {silences_s[topic]:.1f} s", fix)
+            return f"no {topic} for {silences_s[topic]:.1f} s", fix
         with self._topics.lock:
             view = self._topics.view()
         vx, vy, yaw_rate = view.twist
         if abs(yaw_rate) > REST_YAW_RATE or math.hypot(vx, vy) > REST_SPEED:
-            return Hindrance("it is still moving", "stop whatever else drives it")
+            return "it is still moving", "stop whatever else drives it"
         if start is None or self._options.start == "present":
             return None
-        return self._find_start_error(view.pose, start)
-
-    def _find_start_error(self, pose: Array, start: Start) -> Hindrance | None:
-        dx, dy, turn = geometry.between(pose, start.pose)
+        dx, dy, turn = geometry.between(view.pose, start.pose)
         distance = math.hypot(dx, dy)
         max_distance, max_turn = self._options.tolerance
         if distance <= max_distance and abs(turn) <= max_turn:
@@ -343,7 +333,7 @@ class RealtimeBackend:
             f"it is {distance:.2f} m and {math.degrees(abs(turn)):.0f} deg off its start "
             f"({x:.2f} m, {y:.2f} m, {math.degrees(heading):.0f} deg)"
         )
-        return Hindrance(reason, "place it there, or choose start='present'")
+        return reason, "place it there, or choose start='present'"
 
     def facts(self) -> BackendFacts:
         """Return nothing: the topics carry all that is known."""

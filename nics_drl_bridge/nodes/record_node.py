@@ -248,7 +248,14 @@ class RecordNode(qos.BridgeNode):
         result = "the robot was not moved; nothing is recorded"
         if self._ticks:
             self._halt()
-            recording, result = self._save()
+            try:
+                made = self._log.make_recording()
+                write_drive(made, self._out, self._plan.robot)
+            except (BridgeError, OSError) as error:
+                result = f"nothing was saved ({error})"
+            else:
+                recording = made
+                result = f"{self._log.seconds:.1f} s are recorded in {self._out}"
         if not complete:
             stopped = "the robot was told to stop; " if self._ticks else ""
             result = f"{failure or 'interrupted:'} {stopped}{result}"
@@ -263,14 +270,6 @@ class RecordNode(qos.BridgeNode):
             time.sleep(PERIOD_S)
         if self._topic is not None:
             runner.publish_last(self._topic, self._message(np.zeros(3)))
-
-    def _save(self) -> tuple[Recording | None, str]:
-        try:
-            recording = self._log.make_recording()
-            write_drive(recording, self._out, self._plan.robot)
-        except (BridgeError, OSError) as error:
-            return None, f"nothing was saved ({error})"
-        return recording, f"{self._log.seconds:.1f} s are recorded in {self._out}"
 
 
 def record(

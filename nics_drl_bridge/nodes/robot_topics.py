@@ -20,9 +20,9 @@ from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, RobotView
-from nics_drl_bridge.lidar.sectors import Reader
+from nics_drl_bridge.lidar.sectors import Reader, match_reader
 from nics_drl_bridge.lidar.sensor import Sensor
-from nics_drl_bridge.lidar.spec import LidarSpec, from_device
+from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, from_device
 from nics_drl_bridge.middleware import measurement
 from nics_drl_bridge.middleware.ekf import ANYWHERE, START_STD
 from nics_drl_bridge.middleware.middleware import Middleware
@@ -34,7 +34,7 @@ from nics_drl_bridge.nodes.parameters import (
     NO_POSE,
     POSE_TYPES,
     STAMPED,
-    list_sensor_rows,
+    list_rows,
 )
 from nics_drl_bridge.nodes.runner import declare_row, get_flag, get_text
 from nics_drl_bridge.recording import messages
@@ -49,9 +49,8 @@ KINDS_OF_POSE = {
 
 def declare_sensors(node: Node, stamped: bool | None = None) -> None:
     """Declare a robot's sensors except scan and odometry, and the command type, if known."""
-    for row in list_sensor_rows():
-        if row.name == STAMPED and stamped is not None:
-            row = row._replace(default=stamped)
+    known = {} if stamped is None else {STAMPED: stamped}
+    for row in list_rows("sensors", "stamped", **known):
         declare_row(node, row)
 
 
@@ -86,7 +85,7 @@ class RobotTopics:
         self._on_scan = on_scan
         self._on_lidar = on_lidar
         self._reader: Reader | None = Reader(model.lidar, backwards=False)
-        self._header = b""
+        self._header: tuple[float, ...] = ()
         self._told = ""
         # pose and covariance of `initialpose`
         self._placed: tuple[Array, Array] | None = None
@@ -183,7 +182,16 @@ class RobotTopics:
         logger = self._node.get_logger()
         try:
             pose = read_initial_pose(message, get_text(self._node, "map_frame"))
-            self._placed = pose, self._initial_covariance(message)
+            covariance = START_STD**2 * np.eye(3)
+            if self._posed:  # otherwise nothing corrects this pose: it defines the map
+                _, reported = conversions.pose_from_ros(message)
+                checked = measurement.check_covariance(reported, 3, START_STD)
+                covariance = covariance if checked is None else checked
+            self._placed = pose, covariance
+        except ValueError as error:
+            fix = "give a valid one, or zeros. The estimate stays as it is."
+            logger.error(f"{INITIAL_POSE}: {error}; {fix}")
+            return
         except ConfigError as error:
             logger.error(f"{error} The estimate stays as it is.")
             return
@@ -192,18 +200,6 @@ class RobotTopics:
         logger.info(
             f"the robot is at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad"
         )
-
-    def _initial_covariance(self, message: PoseWithCovarianceStamped) -> Array:
-        """Return the covariance (3, 3) of `initialpose`. Raises ConfigError if it is none."""
-        covariance = None
-        if self._posed:  # otherwise nothing corrects this pose: it defines the map
-            _, reported = conversions.pose_from_ros(message)
-            try:
-                covariance = measurement.check_covariance(reported, 3, START_STD)
-            except ValueError as error:
-                fix = "give a valid one, or zeros."
-                raise ConfigError(f"{INITIAL_POSE}: {error}; {fix}") from None
-        return START_STD**2 * np.eye(3) if covariance is None else covariance
 
     def locate_in_odom(self) -> Array | None:
         """Return the robot's odometry pose (3,) at the newest datum; None before any."""
@@ -256,21 +252,25 @@ class RobotTopics:
             self._on_scan(stamp)
 
     def _find_reader(self, message: LaserScan) -> Reader | None:
-        fields = [
+        header = (
             message.angle_min,
             message.angle_increment,
             message.range_min,
             message.range_max,
-        ]
-        header = np.array([*fields, len(message.ranges)], np.float32).tobytes()
+            len(message.ranges),
+        )
         if header == self._header or self._on_lidar is None:
             return self._reader
         self._header = header
         self._reader = None
         upside_down = get_flag(self._node, "lidar_upside_down")
         try:
-            reader = conversions.reader_from_ros(
-                message, self._model.lidar, upside_down
+            values = (float(getattr(message, name)) for name in ScanHeader._fields)
+            reader = match_reader(
+                ScanHeader(*values),
+                len(message.ranges),
+                self._model.lidar,
+                upside_down,
             )
             if reader.lidar != self._lidar:
                 self._on_lidar(reader.lidar)

@@ -30,9 +30,11 @@ from rclpy.publisher import Publisher
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.errors import BackendError, BridgeError, ConfigError, suggest
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.listener import open_context, spin
 from nics_drl_bridge.nodes.own_process import (
@@ -41,11 +43,9 @@ from nics_drl_bridge.nodes.own_process import (
     list_log_arguments,
 )
 from nics_drl_bridge.nodes.parameters import (
-    MODEL,
     Row,
     find_frame_fault,
-    list_managed_rows,
-    list_sensor_rows,
+    list_rows,
 )
 from nics_drl_bridge.nodes.qos import BridgeNode, copy_profile, override_qos
 
@@ -59,6 +59,8 @@ RANGES = {
     int: (IntegerRange, "integer_range"),
     float: (FloatingPointRange, "floating_point_range"),
 }
+WHOLE = {float: Parameter.Type.INTEGER, list: Parameter.Type.INTEGER_ARRAY}
+PARTS = "node_parts"
 SHARED = "model"  # a file may also set it for nodes without a model
 
 
@@ -173,7 +175,7 @@ def serve(node: Node, name: str, answer: Callable[[], tuple[bool, str]]) -> None
 
 def declare_model(node: Node) -> SimulatorModel:
     """Declare the parameter `model` and open it; ConfigError if `cmd_vel` can't drive it."""
-    model = open_model(str(declare_row(node, MODEL)))
+    model = open_model(declare_rows(node, "model")["model"])
     model.robot.require_cmd_vel()
     return model
 
@@ -209,18 +211,18 @@ def declare_row(node: Node, row: Row) -> Any:
     # rclpy refuses whole numbers for a floating-point parameter, as in `rate:=2`.
     given = qos.get_given_values(node).get(row.name)
     value = row.default
-    if given is not None and _holds_whole_numbers(row.default, given):
-        value = np.asarray(given.value, np.float64).tolist()
+    if given is not None:
+        floats = row.default if isinstance(row.default, list) else [row.default]
+        is_float = all(isinstance(each, float) for each in floats)
+        if is_float and given.type_ == WHOLE.get(type(row.default)):
+            value = np.asarray(given.value, np.float64).tolist()
     is_whole = value is not row.default
     return node.declare_parameter(row.name, value, descriptor, is_whole).value
 
 
-def _holds_whole_numbers(default: Any, given: Parameter) -> bool:
-    """True if whole numbers are given for one or more floats."""
-    if isinstance(default, list):
-        is_list_of_floats = all(isinstance(value, float) for value in default)
-        return is_list_of_floats and given.type_ == Parameter.Type.INTEGER_ARRAY
-    return isinstance(default, float) and given.type_ == Parameter.Type.INTEGER
+def declare_rows(node: Node, *groups: str, **known: Any) -> dict[str, Any]:
+    """Declare groups of parameters, see `list_rows`; return their values by their names."""
+    return {row.name: declare_row(node, row) for row in list_rows(*groups, **known)}
 
 
 def explain_ignored_values(node: Node) -> list[str]:
@@ -252,6 +254,31 @@ OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN  # it needs attention
 ERROR = DiagnosticStatus.ERROR  # a fault stops the robot
 STALE = DiagnosticStatus.STALE  # data have stopped to arrive
+
+
+class Wish(NamedTuple):
+    """Motion that a policy requests on the way to a goal."""
+
+    twist: Array  # (3,) for `cmd_vel`
+    touched: bool
+
+
+def open_parts(kind: str, node: Node) -> list[Any]:
+    """Return the parts that extensions add to a kind of node, `device` or `policy`.
+
+    They are the entry points `nics_drl_bridge.node_parts`. An entry `device.NAME` is called with a
+    simulator's node, and `policy.NAME` with a policy node. It declares its parameters then, and
+    returns an object, or None if it has nothing to offer there. A part of a policy node is a
+    leader, which may drive the robot to goals of its own; its methods are those of
+    `extras.nav2.follow_path.PathActions`. Raises BridgeError.
+    """
+    installed = extensions.find_extensions(PARTS)
+    names = [name for name in installed if name.startswith(f"{kind}.")]
+    if not names:  # of an environment that was made before this package had parts
+        fix = "install nics_drl_bridge again."
+        node.get_logger().warning(f"no parts of a {kind} are installed; {fix}")
+    parts = [extensions.load(PARTS, name)(node) for name in names]
+    return [part for part in parts if part is not None]
 
 
 class Condition(NamedTuple):
@@ -296,19 +323,19 @@ FAILURE = TransitionCallbackReturn.FAILURE
 class ManagedNode(BridgeNode, LifecycleNode):
     """A lifecycle node; `configure` creates its resources and puts their clean-up on `undo`.
 
-    It declares the parameters in `rows`, in addition to those of managed nodes and of sensors.
+    It declares the parameters of a group, in addition to those of managed nodes and of sensors.
     """
 
-    def __init__(self, name: str, rows: Sequence[Row], **options: Any) -> None:
+    def __init__(self, name: str, group: str, **options: Any) -> None:
         super().__init__(name, **options)
         self.fixed: set[str] = set()
         self.undo = ExitStack()
-        every = (*list_managed_rows(), *list_sensor_rows(), *rows)
-        values = [declare_row(self, row) for row in every]
+        shared = ("managed", "model", "sensors", "stamped", "frames")
+        values = declare_rows(self, *shared, group)
         fault = find_frame_fault(self.get_parameters_by_prefix("").values())
         if fault:
             raise ConfigError(fault)
-        self._autostart = bool(values[0])
+        self._autostart = bool(values["autostart"])
         # the last primary state
         self.state = UNCONFIGURED
         self._starting = False

@@ -1,17 +1,16 @@
 """simulator_node: the fast simulator, or another one, behind the topics of the hardware."""
 
-import heapq
 import itertools
 import math
 import time
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from diagnostic_msgs.srv import SelfTest
-from geometry_msgs.msg import TransformStamped
-from nav_msgs.msg import Odometry
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.serialization import serialize_message
@@ -20,7 +19,7 @@ from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool
 
 from nics_drl_bridge import defaults
-from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
@@ -35,21 +34,29 @@ from nics_drl_bridge.nodes import (
     wire,
 )
 from nics_drl_bridge.nodes.command_types import KINDS, TypeWatch, name_of
-from nics_drl_bridge.nodes.conversions import find_sensor_type, sensor_to_ros
-from nics_drl_bridge.nodes.frames import compute_odom_in_map, transform_to_ros
+from nics_drl_bridge.nodes.conversions import (
+    INITIAL_POSE,
+    find_sensor_type,
+    read_initial_pose,
+    sensor_to_ros,
+)
+from nics_drl_bridge.nodes.frames import (
+    compute_odom_in_map,
+    find_transforms,
+    transform_to_ros,
+)
 from nics_drl_bridge.nodes.link import EPISODE_NS, get_fingerprints
-from nics_drl_bridge.nodes.message_packages import explain_install
-from nics_drl_bridge.nodes.parts import open_parts
 from nics_drl_bridge.nodes.runner import OK, WARN
-from nics_drl_bridge.nodes.world_topics import WorldTopics
 from nics_drl_bridge.pacing import RealTime, TopicPace
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
+from nics_drl_bridge.sim.occupancy import occupancy, standing
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 CLOCK = "/clock"
 CLOCK_NS = 15_000_000  # longest time between two ticks of it in real time
 WATCH_S = 2.0  # between two checks for other publishers of /clock
+MAP_S = 0.2  # between two checks of what stands in the world
 QUIET_S = 5.0  # between two equal warnings
 LAGGING_S = 5.0  # diagnostics warn for this long after it fell behind real time
 PART = "simulator"  # end of its name in diagnostics
@@ -61,14 +68,20 @@ LONGEST_TICK_S = 0.005
 MakeSimulator = Callable[[Node, SimulatorModel, AnyWorld, int], FastSimulator]
 
 
+class Waiting(NamedTuple):
+    """A message that is to be published later."""
+
+    due_ns: int
+    publisher: Publisher
+    content: bytes
+
+
 class Outbox:
     """Publishes messages after a latency and a jitter, or at once; each topic keeps its order."""
 
     def __init__(self) -> None:
         self._random = np.random.default_rng(0)
-        self._waiting: list[tuple[int, int, Publisher, bytes]] = []
-        self._latest: dict[Publisher, int] = {}
-        self._numbers = itertools.count()
+        self._waiting: list[Waiting] = []
 
     def send(
         self, publisher: Publisher, message: Any, now_ns: int, late: tuple[int, int]
@@ -80,71 +93,53 @@ class Outbox:
         if not delay:
             publisher.publish(message)
             return
-        due = max(now_ns + delay, self._latest.get(publisher, 0))
-        self._latest[publisher] = due
+        before = (each for each in self._waiting if each.publisher is publisher)
+        due_ns = max((now_ns + delay, *(each.due_ns for each in before)))
         content = message if isinstance(message, bytes) else serialize_message(message)
-        heapq.heappush(self._waiting, (due, next(self._numbers), publisher, content))
+        self._waiting.append(Waiting(due_ns, publisher, content))
 
     def flush(self, now_ns: int) -> None:
         """Publish what is due."""
-        while self._waiting and self._waiting[0][0] <= now_ns:
-            _, _, publisher, content = heapq.heappop(self._waiting)
-            publisher.publish(content)
+        due = [each for each in self._waiting if each.due_ns <= now_ns]
+        self._waiting = [each for each in self._waiting if each.due_ns > now_ns]
+        for each in sorted(due, key=lambda each: each.due_ns):
+            each.publisher.publish(each.content)
 
     def drop(self, publishers: Collection[Publisher]) -> None:
         """Drop the waiting messages of publishers that are about to end."""
-        self._waiting = [
-            waiting for waiting in self._waiting if waiting[2] not in publishers
-        ]
-        heapq.heapify(self._waiting)
-        for publisher in publishers:
-            self._latest.pop(publisher, None)
+        self._waiting = [w for w in self._waiting if w.publisher not in publishers]
 
     def clear(self) -> None:
         """Drop all waiting messages, because their episode is over."""
         self._waiting.clear()
-        self._latest.clear()
 
 
 class RobotPort:
-    """Publishes `scan`, `odom`, further sensors, `joint_states`, `ground_truth` of one robot."""
+    """The topics of one robot: takes its commands, and publishes what is sensed."""
 
-    def __init__(
-        self,
-        node: "DeviceNode",
-        name: str,
-        take: Callable[["RobotPort", Array], None],
-    ) -> None:
+    def __init__(self, node: "DeviceNode", name: str) -> None:
         self._node = node
         self._model = model = node.model
         self.name = name.strip("/") or model.robot.name
         self.frames = frames = device_parameters.get_frames(node, name.strip("/"))
-        self.namespace = namespace = f"{name}/" if name else ""
-        self._publishers: list[Publisher] = []
-        self.inlet = CommandInlet(node, namespace, partial(take, self))
+        self._namespace = f"{name}/" if name else ""
         self.command_ns = 0  # time of the newest command
         self.has_command = False  # in lock-step: since the last step
+        self._publishers: list[Publisher] = []
+        self._subscribe()
         self._joint_writer = conversions.JointWriter(model.robot)
         timing = node.timing
         self._send = partial(node.outbox.send, late=timing.odom_late_ns)
         self._send_scan = partial(node.outbox.send, late=timing.scan_late_ns)
-
-        def publisher(kind: Any, topic: str) -> Publisher:
-            made = node.create_publisher(
-                kind, f"{namespace}{topic}", qos.SENSOR_RELIABLE
-            )
-            self._publishers.append(made)
-            return made
-
-        self._scans = publisher(LaserScan, "scan")
-        self._odoms = publisher(Odometry, "odom")
-        self._truths = publisher(Odometry, "ground_truth")
-        self._joints = publisher(JointState, "joint_states")
+        self._scans = self._publish_on("scan", LaserScan)
+        self._odoms = self._publish_on("odom", Odometry)
+        self._truths = self._publish_on("ground_truth", Odometry)
+        self._joints = self._publish_on("joint_states", JointState)
         self._sensors = [
             (
                 sensor,
                 frames.prefix + sensor.frame,
-                publisher(find_sensor_type(sensor), sensor.name),
+                self._publish_on(sensor.name, find_sensor_type(sensor)),
             )
             for sensor in model.sensors
         ]
@@ -163,12 +158,95 @@ class RobotPort:
         self._truth = wire.OdometryWriter(at_rest((frames.map, frames.base), truth))
         self._locates = runner.get_flag(node, "publish_map_to_odom")
 
+    def _publish_on(self, topic: str, kind: Any) -> Publisher:
+        made = self._node.create_publisher(
+            kind, f"{self._namespace}{topic}", qos.SENSOR_RELIABLE
+        )
+        self._publishers.append(made)
+        return made
+
+    def _subscribe(self) -> None:
+        """Listen to `cmd_vel`, `initialpose`, and to `ackermann_cmd` if the robot steers."""
+        node = self._node
+        space = self._namespace
+        quality = qos.EVERY_COMMAND if node.timing.lockstep else qos.COMMAND
+        self._stamped = runner.get_flag(node, "enable_stamped_cmd_vel")
+        kind = name_of(self._stamped)
+        self._commands = node.create_subscription(
+            KINDS[kind], f"{space}{CMD_VEL}", self._take_bytes, quality, raw=True
+        )
+        self._topic = self._commands.topic_name
+        self._types = TypeWatch(node, self._topic, kind)
+        self._subscriptions = [
+            self._commands,
+            node.create_subscription(
+                PoseWithCovarianceStamped,
+                f"{space}{INITIAL_POSE}",
+                partial(node.put_robot, self),
+                qos.COMMAND,
+            ),
+        ]
+        drive = conversions.find_message_type(
+            "ackermann_msgs/msg/AckermannDriveStamped"
+        )
+        if self._model.robot.steers and drive is not None:  # its package is optional
+            topic = f"{space}ackermann_cmd"
+            self._subscriptions.append(
+                node.create_subscription(drive, topic, self._take_ackermann, quality)
+            )
+
     def close(self) -> None:
         """End its topics."""
-        self.inlet.close()
+        self._types.close()
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
         self._node.outbox.drop(self._publishers)
         for publisher in self._publishers:
             self._node.destroy_publisher(publisher)
+
+    def take_waiting(self) -> None:
+        """Take the commands that have arrived but are not handled yet."""
+        for content in qos.take_waiting(self._commands):
+            self._take_bytes(content)
+
+    def _take_bytes(self, content: bytes) -> None:
+        stamp_ns = 0
+        try:
+            if self._stamped:
+                stamp_ns = wire.read_stamp(content)
+                twist = wire.read_stamped_twist(content)
+            else:
+                twist = wire.read_twist(content)
+        except wire.UNREADABLE as error:
+            self._complain(f"a message that can't be read ({error}) is ignored")
+            return
+        self._obey(stamp_ns, twist, self._model.robot.from_cmd_vel)
+
+    def _take_ackermann(self, message: Any) -> None:
+        drive = message.drive
+        stamp_ns = conversions.stamp_from_ros(message.header.stamp)
+        fields = (drive.speed, 0.0, drive.steering_angle)
+        self._obey(stamp_ns, fields, self._model.robot.from_fields)
+
+    def _obey(
+        self,
+        stamp_ns: int,
+        fields: Sequence[float],
+        read: Callable[[Sequence[float]], Array],
+    ) -> None:
+        if stamp_ns and self._node.is_too_old(stamp_ns):
+            why = "its stamp is older than command_timeout"
+            fix = "do both ends use one clock (use_sim_time)?"
+            self._complain(f"a command is ignored, because {why}; {fix}")
+        elif all(map(math.isfinite, fields)):
+            self._node.take_command(self, read(fields))
+        else:
+            self._complain("NaN or inf ignored")
+
+    def _complain(self, what: str) -> None:
+        self._node.get_logger().warning(
+            f"{self._topic}: {what}", throttle_duration_sec=QUIET_S
+        )
 
     def mounts(self) -> list[TransformStamped]:
         """Return the transforms base_link -> laser, to each further sensor, and footprint."""
@@ -213,88 +291,35 @@ class RobotPort:
             self._send_scan(publisher, reading, now_ns)
 
 
-class CommandInlet:
-    """Listens to `cmd_vel`, stamped or not, and to `ackermann_cmd` if the robot steers."""
+class MapTopic:
+    """Publishes `map`, the occupancy of everything that stands.
 
-    def __init__(
-        self,
-        node: "DeviceNode",
-        namespace: str,
-        take: Callable[[Array], None],
-    ) -> None:
+    The map also reaches late joiners, and is published again when something has changed. It is not
+    computed before anyone subscribes.
+    """
+
+    def __init__(self, node: "DeviceNode") -> None:
         self._node = node
-        self._robot = robot = node.model.robot
-        self._take = take
-        quality = qos.EVERY_COMMAND if node.timing.lockstep else qos.COMMAND
-        stamped = runner.get_flag(node, "enable_stamped_cmd_vel")
-        self._hear = partial(self._on_bytes, stamped)
-        kind = name_of(stamped)
-        self._commands = node.create_subscription(
-            KINDS[kind], f"{namespace}{CMD_VEL}", self._hear, quality, raw=True
-        )
-        self._topic = self._commands.topic_name
-        self.heard = [self._commands]
-        self._types = TypeWatch(node, self._topic, kind)
-        drive = conversions.find_message_type(
-            "ackermann_msgs/msg/AckermannDriveStamped"
-        )
-        if robot.steers and drive is not None:  # its package is optional
-            topic = f"{namespace}ackermann_cmd"
-            self.heard.append(
-                node.create_subscription(drive, topic, self._on_ackermann, quality)
-            )
+        self._cell = runner.get_number(node, "map_resolution")
+        self._map = node.create_publisher(OccupancyGrid, "map", qos.LATCHED)
+        self._shown: Any = None  # the world that was published, and what stood in it
+        runner.call_periodically(node, MAP_S, self.look)
 
-    def close(self) -> None:
-        """End the subscriptions."""
-        self._types.close()
-        for subscription in self.heard:
-            self._node.destroy_subscription(subscription)
-
-    def take_waiting(self) -> None:
-        """Take the commands that have arrived but are not handled yet."""
-        for content in qos.take_waiting(self._commands):
-            self._hear(content)
-
-    def _on_bytes(self, stamped: bool, content: bytes) -> None:
-        stamp_ns = 0
-        try:
-            if stamped:
-                stamp_ns = wire.read_stamp(content)
-                twist = wire.read_stamped_twist(content)
-            else:
-                twist = wire.read_twist(content)
-        except wire.UNREADABLE as error:
-            self._complain(f"a message that can't be read ({error}) is ignored")
+    def look(self) -> None:
+        """Publish the map if it has changed."""
+        if self._shown is None and not self._map.get_subscription_count():
             return
-        if self._is_fresh(stamp_ns):
-            self._obey(twist)
-
-    def _obey(
-        self,
-        twist: Sequence[float],
-        read: Callable[[Sequence[float]], Array] | None = None,
-    ) -> None:
-        if all(map(math.isfinite, twist)):
-            self._take((read or self._robot.from_cmd_vel)(twist))
-        else:
-            self._complain("NaN or inf ignored")
-
-    def _on_ackermann(self, message: Any) -> None:
-        if self._is_fresh(conversions.stamp_from_ros(message.header.stamp)):
-            angle = message.drive.steering_angle
-            self._obey((message.drive.speed, 0.0, angle), self._robot.from_fields)
-
-    def _is_fresh(self, stamp_ns: int) -> bool:
-        if not stamp_ns or not self._node.is_too_old(stamp_ns):
-            return True
-        why = "its stamp is older than command_timeout; do both ends use one clock (use_sim_time)?"
-        self._complain(f"a command is ignored, because {why}")
-        return False
-
-    def _complain(self, what: str) -> None:
-        self._node.get_logger().warning(
-            f"{self._topic}: {what}", throttle_duration_sec=QUIET_S
-        )
+        world = self._node.device
+        simulator = world.simulator
+        member = int(simulator.data.member[0])
+        still = standing(simulator.sampler, member, simulator.obstacles[0])
+        poses = [(shape, tuple(np.asarray(pose))) for shape, pose in still]
+        shown = (world, member, poses)
+        if shown != self._shown:
+            self._shown = shown
+            grid = occupancy(simulator.world.members[member], still, self._cell)
+            frame = self._node.map_frame
+            self._map.publish(conversions.map_to_ros(grid, self._node.now_ns, frame))
 
 
 class DeviceNode(qos.BridgeNode):
@@ -327,7 +352,7 @@ class DeviceNode(qos.BridgeNode):
         self._open_topics()
         self._start_time()
         # its entities include those of the first episode
-        self._parts = open_parts("device", self)
+        self._parts = runner.open_parts("device", self)
         self.begin()
 
     def use_world(self, world: AnyWorld) -> None:
@@ -363,7 +388,7 @@ class DeviceNode(qos.BridgeNode):
         self._clock_topic = self.create_publisher(Clock, CLOCK, qos.SENSOR_RELIABLE)
         self._clocks = {self.get_fully_qualified_name()}
         self._ports: list[RobotPort] = []
-        self._world_topics = WorldTopics(self)
+        self.map_topic = MapTopic(self)
         for name in self._names:
             self._open_robot(name)
         self._open_transforms()
@@ -375,11 +400,7 @@ class DeviceNode(qos.BridgeNode):
         runner.diagnose(self, PART, self._look)
 
     def _open_robot(self, name: str) -> None:
-        port = RobotPort(self, name, self._on_command)
-        port.inlet.heard.append(
-            self._world_topics.hear(port.namespace, lambda: self._ports.index(port))
-        )
-        self._ports.append(port)
+        self._ports.append(RobotPort(self, name))
 
     def add_robot(self, namespace: str) -> None:
         """Open the topics of the robot that was added to the device last."""
@@ -401,13 +422,8 @@ class DeviceNode(qos.BridgeNode):
         self._complete.trigger()  # not here: more robots may be about to leave
 
     def _open_transforms(self) -> None:
-        self._transforms: Any = conversions.transforms_type()
+        self._transforms: Any = find_transforms(self, "/tf and /tf_static are")
         if self._transforms is None:
-            silent = "so neither /tf nor /tf_static is published"
-            fix = explain_install("tf2_msgs")
-            self.get_logger().warning(
-                f"the package tf2_msgs is not installed, {silent}; {fix}."
-            )
             return
         self._moving = self.create_publisher(self._transforms, "/tf", qos.TRANSFORMS)
         self._fixed = self.create_publisher(self._transforms, "/tf_static", qos.LATCHED)
@@ -490,7 +506,8 @@ class DeviceNode(qos.BridgeNode):
         timeout_ns = int(runner.get_number(self, "command_timeout") * NS_PER_S)
         return not self.timing.lockstep and self.now_ns - stamp_ns > timeout_ns
 
-    def _on_command(self, port: RobotPort, command: Array) -> None:
+    def take_command(self, port: RobotPort, command: Array) -> None:
+        """Let a robot follow a command (C,)."""
         if port not in self._ports:  # its robot has left since the command arrived
             return
         robot = self._ports.index(port)
@@ -499,6 +516,30 @@ class DeviceNode(qos.BridgeNode):
         if self.timing.lockstep and not self.paused:
             port.has_command = True
             self._advance_if_complete()
+
+    def put_robot(self, port: RobotPort, message: PoseWithCovarianceStamped) -> None:
+        """Put a robot at the pose of an `initialpose`, if it can be used."""
+        logger = self.get_logger()
+        simulator = self.device.simulator
+        try:
+            pose = read_initial_pose(message, self.map_frame)
+            world = simulator.world.members[int(simulator.data.member[0])]
+            x1, y1, x2, y2 = world.extent
+            if not (x1 <= pose[0] <= x2 and y1 <= pose[1] <= y2):
+                where = f"x {x1:g} to {x2:g} m, y {y1:g} to {y2:g} m"
+                place = f"x {pose[0]:.2f} m, y {pose[1]:.2f} m"
+                raise ConfigError(
+                    f"{INITIAL_POSE}: {place} is outside the world ({where})."
+                )
+        except ConfigError as error:
+            logger.error(f"{error} The robot stays where it is.")
+            return
+        robot = self._ports.index(port)
+        simulator.put_robot(robot, pose, np.zeros(simulator.data.state.shape[-1]))
+        self.device.put(robot)
+        logger.info(
+            f"the robot was put at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad"
+        )
 
     def _advance_if_complete(self) -> None:
         """In lock-step, move the world once all present robots have a command."""
@@ -596,7 +637,7 @@ class DeviceNode(qos.BridgeNode):
         # The executor may serve a request before a command that was sent earlier. In lock-step that
         # command would move the world of the new episode.
         for port in self._ports:
-            port.inlet.take_waiting()
+            port.take_waiting()
         try:
             self.begin()
         except BridgeError as error:
@@ -643,7 +684,7 @@ class DeviceNode(qos.BridgeNode):
 
 def declare_renderer(node: Node, default: Renderer) -> Renderer:
     """Declare the parameter `renderer`, and return its value."""
-    runner.declare_row(node, parameters.make_renderer_row(default))
+    runner.declare_rows(node, "renderer", renderer=default)
     return cast(Renderer, device_parameters.get_choice(node, "renderer", RENDERERS))
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.nodes import own_process, transport
-from nics_drl_bridge.nodes.parameters import NODES
+from nics_drl_bridge.nodes.parameters import describe_node, list_nodes
 
 HELP = ("-h", "--help")
 ROS = "--ros-args"
@@ -23,9 +23,9 @@ WIDTH = 100
 
 def format_help(node: str) -> str:
     """Return the help of a node by the name of its executable."""
-    if node not in NODES:
+    if node not in list_nodes():
         return f"usage: {node} [{ROS} -p NAME:=VALUE -r FROM:=TO ...]\n"
-    facts = NODES[node]()
+    facts = describe_node(node)
     hang = partial(textwrap.fill, width=WIDTH, subsequent_indent=" " * 8)
     topics = [
         hang(f"{title}: {', '.join(names)}")

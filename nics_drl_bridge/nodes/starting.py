@@ -1,15 +1,15 @@
 """The nodes that `nics up` and the launch files start, and their parameters; needs no ROS 2.
 
-A launch is a list of arguments and of functions, each of which yields the nodes of one part:
-`simulator`, `bridge`, `description`. An empty argument leaves the value of the parameter
-file, unless its description says otherwise.
+A launch is a list of parts. A part is a function that yields its nodes: `simulator`, `bridge`,
+`description`. The parts of a launch determine its arguments. An empty argument leaves the value of
+the parameter file, unless its description says otherwise.
 """
 
 import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,16 +22,12 @@ from nics_drl_bridge.config import (
     share_folder,
 )
 from nics_drl_bridge.errors import ConfigError, suggest
-from nics_drl_bridge.nodes.parameters import (
-    BASE_FRAME,
-    IMU,
-    MODEL,
-    STAMPED,
-    name_fleet,
-)
+from nics_drl_bridge.nodes.parameters import BASE_FRAME, IMU, STAMPED, name_fleet
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 STATE_PUBLISHER = "robot_state_publisher"
 RVIZ = "rviz2"
+BASE_LINK = "base_link"  # base frame by default
 SHIPPED_LASER = "laser"  # frame of the lidar in the URDFs of the shipped robots
 TRANSFORMS = ("/tf", "/tf_static")
 # RViz names topics absolutely; here they are remapped to the robot's namespace.
@@ -52,7 +48,7 @@ FLAGS = (
     "use_robot_state_pub",
     "use_sim_time",
 )
-FLAG_WORDS = {"true": "true", "1": "true", "false": "false", "0": "false", "": ""}
+FLAG_WORDS = {"true": True, "1": True, "false": False, "0": False, "": None}
 Values = Mapping[str, str]  # of the arguments, by name
 
 
@@ -97,7 +93,7 @@ class Setup:
     """The settings from the arguments; what they leave open is up to the nodes and their file."""
 
     def __init__(self, values: Values) -> None:
-        self.values = dict(values)
+        self.values: dict[str, Any] = dict(values)
         # What is wrong is refused here, before any node is started.
         for name in FLAGS:
             word = self[name]
@@ -115,46 +111,30 @@ class Setup:
             from nics_drl_bridge.sim.world_set import load_worlds
 
             load_worlds(self["world"])  # it takes a second
-        self.model = self["model"] or str(MODEL.default)
+        self.model = self["model"] or DEFAULT_ROBOT
         shipped = share_folder() / "urdf" / f"{self.model}.urdf"
-        self._opened: Any = None if shipped.is_file() else opened(self.model)
+        self._opened: Any = None if shipped.is_file() else open_slowly(self.model)
         self.urdf = self["urdf"] or (str(shipped) if self._opened is None else "")
-        self.simulator = f"{self['simulator']}_node"
         space = self["namespace"].strip("/")
-        self.fleet = names_of(self["robots"])
-        self.robots = [Robot(space, "", space)]
-        if self.fleet:
-            self.robots = [
-                Robot(f"{space}/{n}".strip("/"), f"{n}/", space) for n in self.fleet
-            ]
+        self.fleet = parse_robots(self["robots"])
+        self.whole = Robot(space, "", space)  # a single robot, or the simulator of all
+        self.robots = [
+            Robot(f"{space}/{name}".strip("/"), f"{name}/", space)
+            for name in self.fleet
+        ] or [self.whole]
 
-    def __getitem__(self, name: str) -> str:
-        """Return an argument; empty if it was left empty or the launch does not have it."""
+    def __getitem__(self, name: str) -> Any:
+        """Return an argument, a flag as True, False or None; "" if the launch does not have it."""
         return self.values.get(name, "")
 
-    def text(self, name: str) -> str | None:
-        """Return an argument, or None if it was left empty."""
-        return self[name] or None
-
-    def flag(self, name: str) -> bool | None:
-        """Return an argument that is true or false, or None if it was left empty."""
-        return self[name] == "true" if self[name] else None
-
-    def limits(self) -> str:
+    def choose_limits(self) -> str:
         """Return the gate's limits; by default the shipped limits of the given model, if any."""
         if self["limits"] or not self["model"]:
-            return self["limits"]
+            return str(self["limits"])
         robot = self.model if self._opened is None else self._opened.robot.name
         return robot if robot in list_shipped("limits") else ""
 
-    def frame(self, robot: Robot) -> str | None:
-        """Return the base frame of a robot; None if a single robot's was left empty."""
-        base = self[BASE_FRAME.name]
-        if not robot.frames:
-            return base or None
-        return f"{robot.frames}{base or BASE_FRAME.default}"
-
-    def description(self) -> str:
+    def describe_robot(self) -> str:
         """Return the URDF of the robot. Raises ConfigError if no argument names the robot."""
         own_file = self["params_file"] not in ("", find_shipped_parameters())
         if own_file and not (self["model"] or self["urdf"]):
@@ -162,20 +142,20 @@ class Setup:
             raise ConfigError(
                 f"{STATE_PUBLISHER} has to know which robot it is; {fix}."
             )
-        base = self[BASE_FRAME.name] or str(BASE_FRAME.default)
+        base = self[BASE_FRAME] or BASE_LINK
         laser = self["laser_frame"]
-        shipped = base == BASE_FRAME.default and laser in ("", SHIPPED_LASER)
+        shipped = base == BASE_LINK and laser in ("", SHIPPED_LASER)
         if self["urdf"] or (self.urdf and shipped):
             return read_text(self.urdf)
         from nics_drl_bridge.robot.urdf import make_urdf
 
-        model = opened(self.model) if self._opened is None else self._opened
+        model = open_slowly(self.model) if self._opened is None else self._opened
         further = {sensor.frame: sensor.mount for sensor in model.sensors}
         return make_urdf(
             model.robot, model.lidar.mount, laser or model.lidar.frame, base, further
         )
 
-    def node(
+    def start(
         self,
         package: str,
         executable: str,
@@ -184,7 +164,7 @@ class Setup:
         arguments: Sequence[str] = (),
         remappings: Sequence[tuple[str, str]] = (),
     ) -> NodeStart:
-        """Return a node with the given parameters; those that are None are left out."""
+        """Return a node with the given parameters; those that are empty or None are left out."""
         # As in Nav2, transforms stay in a namespace; a fleet shares one for transforms and map.
         alone = robot.transforms == robot.namespace
         place = "" if alone else f"/{robot.transforms}/".replace("//", "/")
@@ -194,7 +174,9 @@ class Setup:
             executable=executable,
             namespace=robot.namespace,
             parameters={
-                name: value for name, value in parameters.items() if value is not None
+                name: value
+                for name, value in parameters.items()
+                if value not in (None, "")
             },
             params_file=self["params_file"] if package == PACKAGE else "",
             remappings=[
@@ -209,14 +191,138 @@ class Setup:
 Part = Callable[[Setup], Iterator[NodeStart]]
 
 
+def simulator(setup: Setup) -> Iterator[NodeStart]:
+    """Yield the simulator of all robots."""
+    names = ["model", "world", BASE_FRAME, "laser_frame"]
+    if setup["simulator"] == "dart":
+        names.append("urdf")
+    parameters = {
+        "robots": list(setup.fleet) or 1,
+        "episode_start": parse_start(setup["start"]),
+        STAMPED: setup["stamped"],
+        **{name: setup[name] for name in names},
+    }
+    executable = f"{setup['simulator']}_node"
+    yield setup.start(PACKAGE, executable, setup.whole, parameters)
+
+
+def bridge(setup: Setup) -> Iterator[NodeStart]:
+    """Yield gate, middleware and policy of each robot."""
+    managed = {name: setup[name] for name in ("autostart", IMU)}
+    nodes: dict[str, dict[str, Any]] = {
+        "command_gate": {
+            "e_stop_required": setup["e_stop_required"] is not False,
+            "limits": setup.choose_limits(),
+        },
+        "middleware_node": managed,
+        "policy_node": {**managed, "policy": setup["policy"]},
+    }
+    for robot in setup.robots:
+        frame = setup[BASE_FRAME]
+        if robot.frames:
+            frame = f"{robot.frames}{frame or BASE_LINK}"
+        for node, parameters in nodes.items():
+            shared = {
+                "model": setup["model"],
+                STAMPED: setup["stamped"],
+                "use_sim_time": setup["use_sim_time"],
+                BASE_FRAME: frame,
+            }
+            yield setup.start(PACKAGE, node, robot, {**shared, **parameters})
+
+
+def description(setup: Setup) -> Iterator[NodeStart]:
+    """Yield robot_state_publisher of each robot, and RViz, if requested."""
+    timed = {"use_sim_time": setup["use_sim_time"]}
+    if setup["use_robot_state_pub"]:
+        drawn = setup.describe_robot()
+        for robot in setup.robots:
+            parameters = {
+                **timed,
+                "robot_description": drawn,
+                "frame_prefix": robot.frames,
+            }
+            yield setup.start(STATE_PUBLISHER, STATE_PUBLISHER, robot, parameters)
+    if setup["rviz"]:
+        first = setup.robots[0]
+        # the map is shared by all robots
+        topics = [("/map", f"/{first.transforms}/map".replace("//", "/"))]
+        topics += [(f"/{topic}", topic) for topic in SHOWN]
+        yield setup.start(
+            RVIZ, RVIZ, first, timed, ("-d", setup["rviz_config"]), topics
+        )
+
+
 @dataclass(frozen=True)
 class Launch:
-    """Parts that are started together, and the arguments that select them."""
+    """Parts that are started together; their arguments may have other defaults here."""
 
     about: str
     parts: Sequence[Part]
-    arguments: Sequence[Argument]
-    simulated: bool = False
+    defaults: Values = field(default_factory=dict)
+    left_out: Sequence[str] = ()  # names of arguments
+
+    @property
+    def arguments(self) -> list[Argument]:
+        """The arguments that choose and configure the nodes."""
+        stamped = (
+            "Use TwistStamped for cmd_vel; "
+            "empty: params_file, else TwistStamped on Kilted and newer"
+        )
+        limits = "Limits of the gate; empty: those of the model, if given, else from params_file"
+        start = "Start x, y, heading [m, m, rad] of each robot; empty: drawn at random"
+        required = (
+            "Require e_stop: if never received, it counts as pressed; empty: true"
+        )
+        kinds = ("simulator", "mujoco", "dart")
+        fleet = "Number of robots, or their namespaces, as in '[a, b]'"
+        installed = "true" if find_prefix(STATE_PUBLISHER) else "false"
+        view = str(share_folder() / "config" / "rviz" / "bridge.rviz")
+        from_file = "empty: from params_file"
+        every: list[tuple[Any, ...]] = [
+            ("model", "", f"Shipped robot, or folder of a model; {from_file}"),
+            ("namespace", "", "Namespace of the robot, or of the fleet"),
+            (BASE_FRAME, "", f"Frame of the robot; {from_file}"),
+            ("use_sim_time", "false", "Use /clock"),
+            ("log_level", "info", "Log level of all nodes"),
+        ]
+        if simulator in self.parts or bridge in self.parts:
+            every += [
+                ("params_file", find_shipped_parameters(), "Parameters of all nodes"),
+                ("stamped", "", stamped),
+            ]
+        if simulator in self.parts:
+            every += [
+                ("simulator", kinds[0], "The fast simulator, MuJoCo or DART", kinds),
+                ("world", "", f"Shipped world, or a YAML file; {from_file}"),
+                ("robots", "1", fleet),
+                ("start", "", start),
+                ("laser_frame", "", f"Frame of the lidar; {from_file}"),
+            ]
+        if bridge in self.parts:
+            every += [
+                ("policy", "", f"Policy file, or name of a policy; {from_file}"),
+                ("limits", "", limits),
+                (
+                    "autostart",
+                    "true",
+                    "Configure and activate managed nodes automatically",
+                ),
+                (IMU, "", f"Topic of the gyro, auto or none; {from_file}"),
+                ("e_stop_required", "true", required),
+            ]
+        if description in self.parts:
+            every += [
+                ("use_robot_state_pub", installed, "Start robot_state_publisher"),
+                ("urdf", "", "URDF file of the robot; empty: the model's"),
+                ("rviz", "false", "Start RViz"),
+                ("rviz_config", view, "Configuration file for RViz"),
+            ]
+        return [
+            Argument(name, self.defaults.get(name, default), *rest)
+            for name, default, *rest in every
+            if name not in self.left_out
+        ]
 
     def nodes(self, values: Values) -> list[NodeStart]:
         """Return the nodes for the given arguments. Raises BridgeError."""
@@ -240,14 +346,14 @@ def complete(arguments: Sequence[Argument], chosen: Values) -> dict[str, str]:
     return values
 
 
-def opened(model: str) -> Any:
+def open_slowly(model: str) -> Any:
     """Return an opened model; this takes seconds, so shipped models are not opened."""
     from nics_drl_bridge.generator import open_model
 
     return open_model(model)
 
 
-def names_of(robots: str) -> tuple[str, ...]:
+def parse_robots(robots: str) -> tuple[str, ...]:
     """Return the namespaces of a fleet from a count or a list; none for one robot."""
     words = re.findall(r"[^\s,\[\]'\"]+", robots)
     if not robots:
@@ -259,7 +365,7 @@ def names_of(robots: str) -> tuple[str, ...]:
     return names if any(names) else ()
 
 
-def numbers_of(start: str) -> list[float] | None:
+def parse_start(start: str) -> list[float] | None:
     """Return x, y, heading of each robot; None if left empty. Raises ConfigError."""
     words = re.findall(r"[^\s,\[\]]+", start)
     try:
@@ -274,152 +380,9 @@ def numbers_of(start: str) -> list[float] | None:
     return numbers or None
 
 
-def simulator(setup: Setup) -> Iterator[NodeStart]:
-    """Yield the simulator of all robots."""
-    robots: Any = list(setup.fleet) or 1
-    space = setup["namespace"].strip("/")
-    parameters = {
-        "model": setup.text("model"),
-        "world": setup.text("world"),
-        "robots": robots,
-        "episode_start": numbers_of(setup["start"]),
-        STAMPED: setup.flag("stamped"),
-        BASE_FRAME.name: setup.text(BASE_FRAME.name),
-        "laser_frame": setup.text("laser_frame"),
-    }
-    if setup["simulator"] == "dart":
-        parameters["urdf"] = setup.text("urdf")
-    yield setup.node(PACKAGE, setup.simulator, Robot(space, "", space), parameters)
-
-
-def bridge(setup: Setup) -> Iterator[NodeStart]:
-    """Yield gate, middleware and policy of each robot."""
-    shared = {
-        "model": setup.text("model"),
-        STAMPED: setup.flag("stamped"),
-        "use_sim_time": setup.flag("use_sim_time"),
-    }
-    required = setup.flag("e_stop_required")
-    of_gate = {
-        "e_stop_required": True if required is None else required,
-        "limits": setup.limits() or None,
-    }
-    managed = {"autostart": setup.flag("autostart"), IMU: setup.text(IMU)}
-    of_policy = {"policy": setup.text("policy")}
-    nodes: dict[str, dict[str, Any]] = {
-        "command_gate": of_gate,
-        "middleware_node": managed,
-        "policy_node": {**managed, **of_policy},
-    }
-    for robot in setup.robots:
-        for node, parameters in nodes.items():
-            frame = {BASE_FRAME.name: setup.frame(robot)}
-            yield setup.node(PACKAGE, node, robot, {**shared, **parameters, **frame})
-
-
-def description(setup: Setup) -> Iterator[NodeStart]:
-    """Yield robot_state_publisher of each robot, and RViz, if requested."""
-    timed = {"use_sim_time": setup.flag("use_sim_time")}
-    if setup.flag("use_robot_state_pub"):
-        drawn = setup.description()
-        for robot in setup.robots:
-            parameters = {
-                **timed,
-                "robot_description": drawn,
-                "frame_prefix": robot.frames or None,
-            }
-            yield setup.node(STATE_PUBLISHER, STATE_PUBLISHER, robot, parameters)
-    if setup.flag("rviz"):
-        first = setup.robots[0]
-        # the map is shared by all robots
-        topics = [("/map", f"/{first.transforms}/map".replace("//", "/"))]
-        topics += [(f"/{topic}", topic) for topic in SHOWN]
-        yield setup.node(RVIZ, RVIZ, first, timed, ("-d", setup["rviz_config"]), topics)
-
-
-def common(use_sim_time: str) -> list[Argument]:
-    """Return the arguments of every launch."""
-    return [
-        Argument(
-            "model", "", "Shipped robot, or folder of a model; empty: from params_file"
-        ),
-        Argument("namespace", "", "Namespace of the robot, or of the fleet"),
-        Argument(BASE_FRAME.name, "", "Frame of the robot; empty: from params_file"),
-        Argument("use_sim_time", use_sim_time, "Use /clock"),
-        Argument("log_level", "info", "Log level of all nodes"),
-    ]
-
-
 def find_shipped_parameters() -> str:
     """Return the path of the parameter file that is used by default."""
     return str(find_config("bridge", "nodes"))
-
-
-def of_nodes() -> list[Argument]:
-    """Return the arguments of every launch that starts nodes of this package."""
-    stamped = (
-        "Use TwistStamped for cmd_vel; "
-        "empty: params_file, else TwistStamped on Kilted and newer"
-    )
-    return [
-        Argument("params_file", find_shipped_parameters(), "Parameters of all nodes"),
-        Argument("stamped", "", stamped),
-    ]
-
-
-def of_simulator(robots: str = "1") -> list[Argument]:
-    """Return the arguments of a simulator."""
-    kinds = ("simulator", "mujoco", "dart")
-    start = "Start x, y, heading [m, m, rad] of each robot; empty: drawn at random"
-    return [
-        Argument("simulator", kinds[0], "The fast simulator, MuJoCo or DART", kinds),
-        Argument("world", "", "Shipped world, or a YAML file; empty: from params_file"),
-        Argument(
-            "robots", robots, "Number of robots, or their namespaces, as in '[a, b]'"
-        ),
-        Argument("start", "", start),
-        Argument("laser_frame", "", "Frame of the lidar; empty: from params_file"),
-    ]
-
-
-def of_bridge() -> list[Argument]:
-    """Return the arguments of gate, middleware and policy, except the emergency stop."""
-    limits = (
-        "Limits of the gate; empty: those of the model, if given, else from params_file"
-    )
-    return [
-        Argument(
-            "policy", "", "Policy file, or name of a policy; empty: from params_file"
-        ),
-        Argument("limits", "", limits),
-        Argument(
-            "autostart",
-            "true",
-            "Configure and activate the managed nodes automatically",
-        ),
-        Argument(IMU, "", "Topic of the gyro, auto or none; empty: from params_file"),
-    ]
-
-
-def e_stop_required(default: str) -> Argument:
-    """Return the argument for the emergency stop."""
-    return Argument(
-        "e_stop_required",
-        default,
-        "Require e_stop: if never received, it counts as pressed; empty: true",
-    )
-
-
-def of_description() -> list[Argument]:
-    """Return the arguments of the description, which draws a robot in RViz."""
-    installed = "true" if find_prefix(STATE_PUBLISHER) else "false"
-    view = str(share_folder() / "config" / "rviz" / "bridge.rviz")
-    return [
-        Argument("use_robot_state_pub", installed, "Start robot_state_publisher"),
-        Argument("urdf", "", "URDF file of the robot; empty: the model's"),
-        Argument("rviz", "false", "Start RViz"),
-        Argument("rviz_config", view, "Configuration file for RViz"),
-    ]
 
 
 def find_prefix(package: str) -> Path | None:
@@ -433,43 +396,33 @@ def find_prefix(package: str) -> Path | None:
     return None
 
 
-def whole_simulation(robots: str = "1") -> Launch:
-    """Return a simulator and, on its topics, everything that runs on a vehicle."""
-    arguments = [*common("true"), *of_nodes(), *of_simulator(robots), *of_bridge()]
-    return Launch(
-        "Several robots in one simulator, each with gate, middleware and policy."
-        if robots != "1"
-        else "A simulator and, on its topics, everything that runs on a vehicle.",
+SIMULATED = {"use_sim_time": "true", "e_stop_required": "false"}
+LAUNCHES = {
+    "simulation": Launch(
+        "A simulator and, on its topics, everything that runs on a vehicle.",
         [simulator, bridge, description],
-        [*arguments, e_stop_required("false"), *of_description()],
-        simulated=True,
-    )
-
-
-LAUNCHES: dict[str, Callable[[], Launch]] = {
-    "simulation": whole_simulation,
+        SIMULATED,
+    ),
     # Without any `e_stop` message, a vehicle stays stopped.
-    "vehicle": lambda: Launch(
+    "vehicle": Launch(
         "Gate, middleware and policy of a vehicle; start the drivers of lidar and base separately.",
         [bridge, description],
-        [*common("false"), *of_nodes(), *of_bridge(), *of_description()],
+        left_out=["e_stop_required"],
     ),
-    "fleet": lambda: whole_simulation(robots="2"),
-    "simulator": lambda: Launch(
+    "fleet": Launch(
+        "Several robots in one simulator, each with gate, middleware and policy.",
+        [simulator, bridge, description],
+        {**SIMULATED, "robots": "2"},
+    ),
+    "simulator": Launch(
         "Only a simulator, to be driven through cmd_vel from elsewhere.",
         [simulator, description],
-        [*common("true"), *of_nodes(), *of_simulator(), *of_description()],
-        simulated=True,
+        SIMULATED,
     ),
-    "bridge": lambda: Launch(
-        "Gate, middleware and policy on the topics of a robot.",
-        [bridge],
-        [*common("false"), *of_nodes(), *of_bridge(), e_stop_required("true")],
-    ),
-    "description": lambda: Launch(
+    "bridge": Launch("Gate, middleware and policy on the topics of a robot.", [bridge]),
+    "description": Launch(
         "The description of a robot: robot_state_publisher with its URDF, and RViz.",
         [description],
-        [*common("false"), *of_description()],
     ),
 }
 """Every launch by name, for `nics up` and the files in `launch/`."""

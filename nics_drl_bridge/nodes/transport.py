@@ -36,6 +36,7 @@ TABLE = Path("/proc/net/udp")
 # RTPS: the first port of a domain is for multicast
 FIRST_PORT = 7400
 PORTS_OF_A_DOMAIN = 250
+GREATEST_DOMAIN_ID = 232  # above it, DDS has no ports
 
 
 def set_transport(environment: MutableMapping[str, str]) -> None:
@@ -55,20 +56,14 @@ def set_transport(environment: MutableMapping[str, str]) -> None:
     is_fast_dds = environment.get(RMW, FAST_DDS).startswith("rmw_fast")
     if sys.platform != "linux" or not is_fast_dds or has_chosen(environment):
         return
-    if not stays_here(environment):
+    has_range = distribution != OLDEST_DISTRIBUTION
+    stays_here = has_range and environment[RANGE] not in OTHER_RANGES
+    if not stays_here and environment.get(ONLY_LOCAL) != "1":
         environment[TRANSPORTS] = UDP
     elif not any(map(environment.get, PEERS)):
         environment.pop(ONLY_LOCAL, None)  # it would override the others
         environment[RANGE] = BY_PROFILE
         environment[profile] = str(PROFILE)
-
-
-def stays_here(environment: Mapping[str, str]) -> bool:
-    """True if discovery stays on this machine, in an environment that sets its range."""
-    if environment.get(ONLY_LOCAL) == "1":
-        return True
-    has_ranges = environment.get("ROS_DISTRO") != OLDEST_DISTRIBUTION
-    return has_ranges and environment[RANGE] not in OTHER_RANGES
 
 
 def has_chosen(environment: Mapping[str, str]) -> bool:

@@ -17,7 +17,6 @@ from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.listener import Listener
-from nics_drl_bridge.nodes.parameters import MAP_FRAME
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 from nics_drl_bridge.sim.world import World, check_place
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -61,7 +60,7 @@ class RosSource:
         self._gate: str | None = None
         self._truth: Array | None = None
         # frame of goals, as named by the estimate or the simulator
-        self._map_frame = MAP_FRAME.default
+        self._map_frame = "map"
         self._new_lidar: LidarSpec | None = None
         self._drawn_ns = 0
         self._node = Listener(

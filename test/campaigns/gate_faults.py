@@ -21,8 +21,6 @@ from nics_drl_bridge.nodes.gate_faults import FAULTS, LATE_S, Setup, inject_all
 
 ROBOT = "ackermann"
 TWIST = np.array([0.5, 0.0, 0.1])
-LOW = np.array([0.0, 0.0, -0.5])
-HIGH = np.array([1.0, 0.0, 0.5])
 MEDIAN_S = 0.30
 SHORT_PATIENCE_S = 8.0
 # ten times the gate's own [s]
@@ -58,7 +56,7 @@ def measure(given: Given) -> Result:
     with keep_busy(given.load):
         for name in given.fault or FAULTS:
             with tempfile.TemporaryDirectory() as folder:
-                setup = Setup(ROBOT, ROBOT, TWIST, LOW, HIGH, Path(folder))
+                setup = Setup(ROBOT, ROBOT, Path(folder), TWIST)
                 setup = replace(setup, **CHANGES.get(given.control, {}))
                 found = list(inject_all(setup, name, range(given.repeats), tell))
             tell(f"{name}: {len(found)} of {given.repeats}")

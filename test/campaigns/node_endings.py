@@ -24,7 +24,7 @@ from typing import Any
 from campaign import Bars, Given, Result, at_most, run_campaign, some_of, tell
 from parts.processes import keep_busy, make_environment
 
-from nics_drl_bridge.nodes.parameters import NODES
+from nics_drl_bridge.nodes.parameters import list_nodes
 from nics_drl_bridge.nodes.processes import free_domain_id
 
 LIMIT_S = 1.0
@@ -172,7 +172,7 @@ def set_bars(result: Result) -> Bars:
 OPTIONS = {
     "times": (10, "of each node in each phase"),
     "loops": (2, "busy ones"),
-    "nodes": some_of(tuple(NODES)),
+    "nodes": some_of(tuple(list_nodes())),
     "phases": some_of(tuple(PHASES)),
 }
 

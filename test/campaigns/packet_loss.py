@@ -35,8 +35,8 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.faulty_robot import PERIOD_S, Robot
+from nics_drl_bridge.nodes.listener import SpunNode
 from nics_drl_bridge.nodes.processes import NodeProcess
-from nics_drl_bridge.nodes.spun_node import SpunNode
 
 LOSSES = (5, 20)
 # the gate's limit of 0.35 s, and what its tick (0.02 s) and the way to the robot may add
@@ -110,12 +110,15 @@ def run_stack(seconds: float, folder: Path, control: str) -> None:
     (folder / "used.json").write_text(json.dumps(stack.used))
 
 
+class LossyRobot(Robot):
+    quality = qos.SENSOR
+
+
 def run_robot(seconds: float, folder: Path, control: str) -> None:
     """The near end: drives on a whole network, then says so and drives on."""
-    skip = SLOW_SKIP if control == "slow_robot" else 1
-    robot = Robot(
-        None, builtin_model(ROBOT), TWIST, True, skip=skip, sensors=qos.SENSOR
-    )
+    robot = LossyRobot(None, builtin_model(ROBOT), TWIST, True)
+    if control == "slow_robot":
+        robot.odom_per_scan *= SLOW_SKIP
     robot.silent.add("odometry/filtered")  # the stack has an estimate of its own
 
     def drive_until(done: Callable[[], bool], patience_s: float) -> None:

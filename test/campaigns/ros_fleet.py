@@ -24,9 +24,9 @@ from sensor_msgs.msg import LaserScan
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import qos, wire
+from nics_drl_bridge.nodes.listener import SpunNode
 from nics_drl_bridge.nodes.load import read_cpu_time
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
-from nics_drl_bridge.nodes.spun_node import SpunNode
 
 SCAN_HZ = 10.0
 ODOM_HZ = 50.0

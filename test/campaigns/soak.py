@@ -26,8 +26,8 @@ from std_srvs.srv import Trigger
 
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.listener import SpunNode
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
-from nics_drl_bridge.nodes.spun_node import SpunNode
 
 ROBOT = "differential"
 GOALS = np.array([[1.5, 0.0], [1.5, 1.5], [0.0, 1.5], [-1.5, 0.0], [0.0, -1.5]])

@@ -42,8 +42,8 @@ from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.nodes.listener import SpunNode
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
-from nics_drl_bridge.nodes.spun_node import SpunNode
 
 DRIVER = FOLDER / "parts" / "dart_skid_steer.py"
 # The task ends at this distance from the goal by the estimate; the rest is for its drift [m].

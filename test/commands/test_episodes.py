@@ -185,15 +185,16 @@ def test_the_end_of_a_vehicles_episode_is_told_as_believed_and_how_uncertain(
 
 @pytest.mark.parametrize("refusal", ["", "scan_silent"])
 def test_a_vehicle_is_driven_only_if_its_gate_can_be_armed(monkeypatch, refusal):
-    processes = pytest.importorskip("nics_drl_bridge.nodes.processes")
+    operator = pytest.importorskip("nics_drl_bridge.nodes.operator")
     said = []
-    monkeypatch.setattr(processes.Witness, "__init__", lambda self: None)
-    monkeypatch.setattr(processes.Witness, "__exit__", lambda *_: None)
-    monkeypatch.setattr(processes.Witness, "arms", lambda *_: refusal)
+    answer = operator.TriggerAnswer("/ant/command_gate", not refusal, refusal)
+    monkeypatch.setattr(operator.Operator, "__init__", lambda self: None)
+    monkeypatch.setattr(operator.Operator, "__exit__", lambda *_: None)
+    monkeypatch.setattr(operator.Operator, "arm", lambda *_: answer)
     episodes._arm(False, "ant", pytest.fail)
     if refusal:
         with pytest.raises(BackendError, match=r"ant/command_gate .*: scan_silent"):
             episodes._arm(True, "ant", said.append)
     else:
         episodes._arm(True, "ant", said.append)
-        assert said == ["  ant/command_gate is armed"]
+        assert said == ["  /ant/command_gate is armed"]

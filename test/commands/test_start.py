@@ -139,11 +139,11 @@ def test_a_command_that_is_interrupted_ends_with_130_whatever_the_moment(
 @pytest.mark.skipif(sys.platform != "linux", reason="is about POSIX shells")
 def test_a_node_below_a_shell_that_ignores_ctrl_c_takes_it_again():
     ignoring = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
-    name = "nics_drl_bridge.nodes.node_process"
-    run = f"import subprocess, sys; from {name} import restore_interrupt; "
+    name = "nics_drl_bridge.nodes.processes"
+    run = f"import subprocess, sys; from {name} import prepare_child; "
     ask = "import signal; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
     child = (
-        f"subprocess.run([sys.executable, '-c', {ask!r}], preexec_fn=restore_interrupt)"
+        f"subprocess.run([sys.executable, '-c', {ask!r}], preexec_fn=prepare_child())"
     )
     done = subprocess.run(
         [sys.executable, "-c", f"{ignoring}{run}{child}"],

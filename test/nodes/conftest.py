@@ -1,5 +1,8 @@
 import itertools
+import os
 import re
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from importlib.util import find_spec
@@ -7,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import nics
 from domains import claimed_domain
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
@@ -210,3 +214,40 @@ def meet(domains: ExitStack) -> Iterator[Callable[..., Any]]:
     yield make
     for each in peers:
         each.close()
+
+
+@pytest.fixture
+def restored_signals() -> Iterator[None]:
+    """The handlers of signals as they were, after commands that set their own."""
+    before = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    yield
+    for number, handler in before.items():
+        if handler is not None and signal.getsignal(number) != handler:
+            signal.signal(number, handler)
+
+
+@pytest.fixture
+def interrupt(
+    domain_id: int,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    restored_signals: None,
+) -> Callable[..., Any]:
+    """Runs `nics` in this process until `play()` returns, and then Ctrl-C, in another thread."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
+
+    def run(play: Callable[[], object], *words: object) -> Any:
+        def act() -> None:
+            try:
+                play()
+            finally:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        thread = threading.Thread(target=act)
+        thread.start()
+        try:
+            return nics(*words, cwd=tmp_path)
+        finally:
+            thread.join()
+
+    return run

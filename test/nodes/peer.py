@@ -16,7 +16,7 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.spun_node import SpunNode
+from nics_drl_bridge.nodes.listener import SpunNode
 
 DEADLINE_S = 90.0
 # Fast DDS drops an answer whose client the server has not discovered within 0.1 s.

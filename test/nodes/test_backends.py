@@ -62,27 +62,20 @@ def backend(simulator, model, arena):
 
 
 @pytest.fixture(scope="module")
-def commands_heard(simulator, meet):
-    """Speed of each command that reaches somebody else than the simulator."""
-    peer = meet(simulator)
-    return peer, peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND)
+def left(launch, module_domain_id, meet):
+    """A simulator of envs that end, as backend options; commands to it, and who hears them."""
+    namespace = "left"
+    launch("simulator_node", module_domain_id, namespace=namespace, mode="lockstep")
+    peer = meet(module_domain_id, namespace)
+    heard = peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND)
+    options = {"domain_id": module_domain_id, "namespace": namespace}
+    return options, heard, peer
 
 
 def drive(backend, speed=0.5, steps=3):
     backend.reset(START)
     for _ in range(steps):
         backend.step(np.array([speed, 0.0]))
-
-
-def zero_follows(commands_heard, step, act):
-    """Wait until the last command after an act is zero."""
-    peer, heard = commands_heard
-    heard.clear()
-    peer.until(
-        lambda: step() and heard, "a command: the listener has found the backend"
-    )
-    act()
-    peer.until(lambda: heard and heard[-1] == Twist(), "a zero command")
 
 
 def complaint(backend):
@@ -117,17 +110,19 @@ def test_an_env_over_dds_tells_what_one_in_process_does_bit_for_bit(
         drive_alike(here, there, (0, 1, 2, 2, 2**31 - 1))
 
 
-# First of all, because later the backend of the other tests speaks to the same simulator.
 @pytest.mark.parametrize("end", ["error", "close", "garbage"])
-def test_the_end_of_an_env_leaves_a_zero_command_behind(
-    simulator, model, arena, commands_heard, end
-):
-    env = BridgeEnv("dds", model, arena, backend_options={"domain_id": simulator})
+def test_the_end_of_an_env_leaves_a_zero_command_behind(left, model, arena, end):
+    options, heard, peer = left
+    env = BridgeEnv("dds", model, arena, backend_options=options)
     env.myself = env  # a cycle, which only the collector ends
     env.reset(seed=3)
 
-    def act():
-        nonlocal env
+    def drive_on():
+        return env.step(np.array([1.0, 0.0], np.float32))
+
+    heard.clear()
+    try:
+        peer.until(lambda: drive_on() and heard, "a command that is heard")
         if end == "error":
             with pytest.raises(gymnasium.error.InvalidAction):
                 env.step(np.full(2, np.nan, np.float32))
@@ -137,11 +132,7 @@ def test_the_end_of_an_env_leaves_a_zero_command_behind(
         else:
             env = None
             gc.collect()
-
-    try:
-        zero_follows(
-            commands_heard, lambda: env.step(np.array([1.0, 0.0], np.float32)), act
-        )
+        peer.until(lambda: heard and heard[-1] == Twist(), "a zero command")
     finally:
         if env is not None:
             env.close()
@@ -291,13 +282,11 @@ def test_without_a_simulator_the_error_names_all_that_is_missing(
 
 
 def test_somebody_else_who_moves_the_simulator_is_found_out(
-    backend, commands_heard, monkeypatch
+    backend, simulator, meet, monkeypatch
 ):
-    peer, _ = commands_heard
+    peer = meet(simulator)
     drive(backend)
-    intruder = peer.speak(
-        Twist, "cmd_vel", subscribers=2
-    )  # the simulator, and the listener
+    intruder = peer.speak(Twist, "cmd_vel")
     try:
         with monkeypatch.context() as patch:  # first by its deeds alone
             patch.setattr(backend._link, "has_rivals", lambda: False)

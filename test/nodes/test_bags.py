@@ -1,7 +1,6 @@
 import json
 import os
 import resource
-import signal
 import subprocess
 import sys
 
@@ -27,29 +26,6 @@ pytestmark = [pytest.mark.ros, pytest.mark.process, pytest.mark.timeout(240)]
 
 ENDS_S = 60.0
 SMALL_FILE = 100_000  # bytes
-
-
-def nics(domain_id, *words):
-    """Run the command line as a process in a DDS domain."""
-    environment = os.environ | {
-        "ROS_DOMAIN_ID": str(domain_id),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    }
-    command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", *map(str, words)]
-    return subprocess.Popen(
-        command,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def ended(process):
-    """Return what a command printed, and its exit code."""
-    out, err = process.communicate(timeout=ENDS_S)
-    assert "Traceback" not in err
-    return out, err, process.returncode
 
 
 def small_drive(path):
@@ -89,21 +65,22 @@ class Robot:
         self.peer.until(met, what, ENDS_S)
 
 
-def test_a_recorder_writes_a_whole_bag_at_ctrl_c(meet, domain_id, tmp_path):
+def test_a_recorder_writes_a_whole_bag_at_ctrl_c(interrupt, meet, domain_id, tmp_path):
     robot = Robot(meet(domain_id))
     out = tmp_path / "drive"
-    recorder = nics(domain_id, "bag", "record", out, "--json")
     ends = (robot.odom, robot.command)
-    robot.until(
-        lambda: all(end.get_subscription_count() > 0 for end in ends), "a recorder"
-    )
-    until = robot.sent + 40
-    robot.until(lambda: robot.sent > until, "40 more messages")
-    recorder.send_signal(signal.SIGINT)
-    told, err, code = ended(recorder)
-    assert code == 0, err
+
+    def play():
+        robot.until(
+            lambda: all(end.get_subscription_count() > 0 for end in ends), "a recorder"
+        )
+        until = robot.sent + 40
+        robot.until(lambda: robot.sent > until, "40 more messages")
+
+    done = interrupt(play, "bag record", out, "--json")
+    assert done.returncode == 0, done.stderr
     counts = {topic.topic: topic.count for topic in read_bag_info(out).topics}
-    assert json.loads(told) == {"path": str(out), "messages": counts}
+    assert json.loads(done.stdout) == {"path": str(out), "messages": counts}
     assert min(counts["/odom"], counts["/cmd_vel"]) >= 30
     with open_bag(out) as bag:
         assert [offer.reliable for offer in bag.offers("/odom")] == [False]
@@ -130,14 +107,21 @@ def test_a_recorder_flushes_and_tells_where_the_bag_lies_once_the_storage_is_ful
     """What was flushed stays, whatever ends the recorder."""
     robot = Robot(meet(domain_id))
     place = tmp_path / "drive"
-    recorder = nics(domain_id, "bag", "record", place, "--storage", storage)
+    cli = [sys.executable, "-m", "nics_drl_bridge.commands.cli"]
+    recorder = subprocess.Popen(
+        [*cli, "bag", "record", str(place), "--storage", storage],
+        env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     robot.until(lambda: robot.odom.get_subscription_count() > 0, "a recorder of odom")
     robot.until(lambda: count_on_disk(tmp_path) > 10, "a flush")
     assert recorder.poll() is None
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (SMALL_FILE, SMALL_FILE))
     robot.until(lambda: recorder.poll() is not None, "its end")
-    _, err, code = ended(recorder)
-    assert code == 2
+    err = recorder.communicate(timeout=ENDS_S)[1]
+    assert recorder.returncode == 2
+    assert "Traceback" not in err
     (left,) = tmp_path.glob(".drive.*/drive")
     (told,) = (line for line in err.splitlines() if "drive" in line)
     assert told.startswith(f"nics: {place}: ")
@@ -146,7 +130,7 @@ def test_a_recorder_flushes_and_tells_where_the_bag_lies_once_the_storage_is_ful
 
 
 @pytest.fixture
-def replay(domain_id, monkeypatch, tmp_path):
+def replay(domain_id, monkeypatch, tmp_path, restored_signals):
     """Replays a bag in this process, `replay(bag, *options)`; returns what is printed."""
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
 
@@ -155,10 +139,7 @@ def replay(domain_id, monkeypatch, tmp_path):
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
-    yield run
-    for number, handler in before.items():
-        signal.signal(number, handler)
+    return run
 
 
 def test_a_bag_is_published_with_its_time_on_the_clock(
@@ -206,7 +187,7 @@ def test_the_doctor_finds_a_second_driver_beside_the_simulator_and_nothing_else(
     for _ in range(2):
         peer.speak(Twist, "cmd_vel")
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
-    options = ("--model", model_folder, "--duration", "6", "--json")
+    options = ("--model", model_folder, "--duration", "2", "--json")
     done = command_line.nics("doctor", *options, cwd=tmp_path)
     (finding,) = json.loads(done.stdout)["findings"]
     assert done.returncode == 1, done.stderr

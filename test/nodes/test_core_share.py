@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from nics_drl_bridge.nodes.core_share import CoreShare
+from nics_drl_bridge.nodes.load import CoreShare, read_cpu_time
 
 SPENT_S = 0.5
 POLL_S = 0.01
@@ -58,8 +58,6 @@ def test_without_control_groups_it_says_which_file_is_not_there(tmp_path):
 @pytest.mark.process
 @pytest.mark.skipif(sys.platform != "linux", reason="needs Linux")
 def test_a_busy_process_takes_its_share_and_not_more():
-    from nics_drl_bridge.nodes.load import read_cpu_time
-
     try:
         group = CoreShare()
     except OSError as error:

@@ -19,9 +19,8 @@ from nics_drl_bridge.extras.nav2 import follow_path
 from nics_drl_bridge.extras.nav2.follow_path import FOLLOW, NAVIGATE, PathActions
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.nodes import conversions, policy_node
-from nics_drl_bridge.nodes.parts import Wish
 from nics_drl_bridge.nodes.policy_node import PolicyNode
-from nics_drl_bridge.nodes.runner import explain_ignored_values
+from nics_drl_bridge.nodes.runner import Wish, explain_ignored_values
 from nodes.direct import Clock
 from nodes.peer import odometry, scan
 

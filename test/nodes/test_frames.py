@@ -16,8 +16,7 @@ from nics_drl_bridge.nodes.frames import (
     transform_to_ros,
 )
 from nics_drl_bridge.nodes.middleware_node import MiddlewareNode
-from nics_drl_bridge.nodes.parameters import list_policy_rows
-from nics_drl_bridge.nodes.runner import declare_row
+from nics_drl_bridge.nodes.runner import declare_rows
 from nodes.peer import odometry, pose_of
 
 pytestmark = pytest.mark.ros
@@ -47,8 +46,7 @@ class Topics:
 @pytest.fixture
 def frames(make_node):
     node = make_node()
-    for row in list_policy_rows():
-        declare_row(node, row)
+    declare_rows(node, "frames", "policy")
     return GoalFrames(node, Topics())
 
 

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 import os
+import signal
 import time
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,7 +19,8 @@ from gate.assurance.samples import PROTOCOL
 
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.gate.limits import load_limits
-from nics_drl_bridge.nodes import gate_faults
+from nics_drl_bridge.nodes import command_ear, gate_faults
+from nics_drl_bridge.nodes.faulty_robot import Robot
 from nics_drl_bridge.nodes.gate_faults import (
     CONTROLS,
     FAULTS,
@@ -75,6 +80,7 @@ class Process(AbstractContextManager):
     def __init__(self, node, folder, parameters, domain_id):
         self.ended = False
         self.folder = folder
+        self.log = Path(os.devnull)
 
     def poll(self):
         return 1 if self.ended else None
@@ -83,8 +89,11 @@ class Process(AbstractContextManager):
         if self.ended:
             raise BackendError("ended")
 
+    def close(self):
+        self.ended = True
+
     def __exit__(self, *_):
-        pass
+        self.close()
 
 
 class StandIn:
@@ -119,8 +128,7 @@ def injected(monkeypatch):
         monkeypatch.setattr(gate_faults, "NodeProcess", start)
         monkeypatch.setattr(gate_faults, "Robot", lambda *_, **__: robot)
         monkeypatch.setitem(FAULTS, "ours", Fault(0.4, inject))
-        still = np.zeros(3)
-        setup = Setup("differential", "differential", still, still, still, Path("logs"))
+        setup = Setup("differential", "differential", Path("logs"), np.zeros(3))
         results = list(inject_all(setup, "ours", numbers, lines.append))
         return results, lines, processes
 
@@ -129,7 +137,7 @@ def injected(monkeypatch):
 
 def test_a_fault_that_ends_the_gate_has_failed_and_another_gate_is_started(injected):
     def end_gate(around):
-        around.gate.ended = True
+        around.processes["command_gate"].ended = True
 
     results, lines, processes = injected(end_gate, StandIn(), range(2))
     assert [one.time_s for one in results] == [math.inf] * 2
@@ -158,3 +166,38 @@ def test_a_fault_that_the_gate_does_not_answer_is_judged_by_what_is_heard(inject
 
 def test_the_controls_are_faults_that_are_injected():
     assert set(CONTROLS) <= FAULTS.keys()
+
+
+def test_the_base_ends_with_the_process_that_started_it(monkeypatch):
+    base = Mock()
+    base.spin.side_effect = [None, None]  # not more often
+    parent = Mock()
+    parent.is_alive.side_effect = [True, True, False]
+    monkeypatch.setattr(multiprocessing, "parent_process", lambda: parent)
+    monkeypatch.setattr(command_ear, "SpunNode", lambda *_: base)
+    command_ear.hear(None, Mock())
+    for call in base.spin.call_args_list:
+        assert call.kwargs["timeout_s"] <= 1.0
+
+
+def test_a_command_that_a_frozen_gate_had_written_before_does_not_count(monkeypatch):
+    """The middleware may send it when the gate goes on."""
+    ear, base = multiprocessing.Pipe(duplex=False)
+    robot = Robot.__new__(Robot)
+    robot.repair()
+    robot.heard = []
+    robot._ear = ear
+    robot.spin = Mock()
+    clock = SimpleNamespace(time_ns=lambda: 500)
+    monkeypatch.setattr(gate_faults, "time", clock)
+    monkeypatch.setattr(gate_faults, "FROZEN_S", 0.0)
+    told = []
+    monkeypatch.setattr(os, "kill", lambda _, number: told.append(number))
+    gate_faults._freeze_gate(
+        SimpleNamespace(robot=robot, processes={"command_gate": Mock()})
+    )
+    assert told == [signal.SIGSTOP, signal.SIGCONT]
+    base.send((1.0, np.array([0.5, 0.0, 0.0]), 499))
+    base.send((1.1, np.zeros(3), 501))
+    assert robot.until(lambda: robot.heard, 1.0)
+    assert [when for when, _ in robot.heard] == [1.1]

@@ -50,7 +50,7 @@ def launched(launch, given, monkeypatch):
 def test_a_launch_file_starts_the_same_nodes_with_the_same_parameters(
     name, given, monkeypatch
 ):
-    launch = LAUNCHES[name]()
+    launch = LAUNCHES[name]
     known = {argument.name for argument in launch.arguments}
     given = {key: value for key, value in given.items() if key in known}
     wanted = launch.nodes(given)
@@ -73,13 +73,13 @@ def test_a_launch_file_starts_the_same_nodes_with_the_same_parameters(
 
 def test_a_text_that_looks_like_a_number_stays_a_text(monkeypatch):
     monkeypatch.setattr("nics_drl_bridge.sim.world_set.load_worlds", lambda name: None)
-    (node,) = launched(LAUNCHES["simulator"](), {"world": "7"}, monkeypatch)
+    (node,) = launched(LAUNCHES["simulator"], {"world": "7"}, monkeypatch)
     assert plain(node["parameters"][-1]["world"]) == "7"
 
 
 def test_a_fleet_below_a_pushed_namespace_has_its_transforms_there(monkeypatch):
     given = {"ros_namespace": "/site", "namespace": "hall", "robots": "[ant, bee]"}
-    nodes = launched(LAUNCHES["fleet"](), given, monkeypatch)
+    nodes = launched(LAUNCHES["fleet"], given, monkeypatch)
     assert {node["namespace"] for node in nodes} >= {"/site/hall", "/site/hall/bee"}
     places = {dict(node["remappings"])["/tf"] for node in nodes}
     assert places == {"tf", "/site/hall/tf"}

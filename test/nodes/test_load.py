@@ -10,7 +10,7 @@ import pytest
 
 from nics_drl_bridge.commands.doctor import doctor
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.nodes import load, node_process
+from nics_drl_bridge.nodes import load, processes
 from nics_drl_bridge.nodes.load import read_memory_mb
 from nics_drl_bridge.nodes.processes import unused_domain_id
 
@@ -49,14 +49,14 @@ def test_each_node_is_measured_while_commands_of_a_slow_policy_go_to_the_robot(
 
 
 def slow_down_policy(monkeypatch):
-    made = node_process.make_module_command
+    made = processes.make_module_command
 
     def make_slow(module):
         *words, code = made(module)
         path, _, run = code.partition("; from runpy")
         return [*words, f"{path}\n{SLOW}\nfrom runpy{run}"]
 
-    monkeypatch.setattr(node_process, "make_module_command", make_slow)
+    monkeypatch.setattr(processes, "make_module_command", make_slow)
 
 
 def test_the_doctor_prints_what_was_measured(monkeypatch, capsys):

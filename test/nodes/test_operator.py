@@ -7,8 +7,12 @@ import pytest
 
 from nics_drl_bridge.nodes import listener
 from nics_drl_bridge.nodes import operator as module
-from nics_drl_bridge.nodes.goal_answer import GoalAnswer
-from nics_drl_bridge.nodes.operator import GoalRequest, Operator, TriggerAnswer
+from nics_drl_bridge.nodes.operator import (
+    GoalAnswer,
+    GoalRequest,
+    Operator,
+    TriggerAnswer,
+)
 from nodes.direct import Clock
 
 pytestmark = pytest.mark.ros

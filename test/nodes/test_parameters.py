@@ -10,7 +10,12 @@ from nics_drl_bridge.config import find_config, list_shipped, share_folder
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.nodes import parameters, runner
-from nics_drl_bridge.nodes.parameters import NODES, find_frame_fault, is_stamped_default
+from nics_drl_bridge.nodes.parameters import (
+    describe_node,
+    find_frame_fault,
+    is_stamped_default,
+    list_nodes,
+)
 from nics_drl_bridge.nodes.qos import get_given_values
 from nodes.in_process import node_class
 from nodes.test_command_gate import PLAIN, Robot
@@ -22,7 +27,7 @@ RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
 RCLPY_TOPICS = ("/rosout", "/parameter_events", "/transition_event")
 
 
-@pytest.fixture(params=NODES)
+@pytest.fixture(params=list_nodes())
 def node(request, make_node, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made = make_node(kind=node_class(request.param))
@@ -40,7 +45,7 @@ def same(value, default):
 
 def test_help_tells_the_parameters_topics_and_services_of_a_node(node):
     name, made = node
-    facts = NODES[name]()
+    facts = describe_node(name)
     own = {
         each for each in made.get_parameters_by_prefix("") if not each.startswith(RCLPY)
     }
@@ -131,8 +136,8 @@ def test_a_running_node_refuses_such_a_frame_and_keeps_its_own(frame, make_node)
 def test_commands_are_stamped_since_kilted(monkeypatch, distribution, stamped):
     monkeypatch.setenv("ROS_DISTRO", distribution)
     assert is_stamped_default() is stamped
-    for node in NODES:
-        rows = {row.name: row.default for row in NODES[node]().parameters}
+    for node in list_nodes():
+        rows = {row.name: row.default for row in describe_node(node).parameters}
         assert rows["enable_stamped_cmd_vel"] is stamped
 
 
@@ -157,13 +162,13 @@ def test_values_that_are_given_are_known_before_they_are_declared(make_node):
 FILES = sorted((share_folder() / "config" / "nodes").glob("*.yaml"))
 
 
-@pytest.mark.parametrize("name", NODES)
+@pytest.mark.parametrize("name", list_nodes())
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
 def test_a_file_sets_what_a_node_has_and_does_not_derive_from_its_robot(
     name, file, make_node
 ):
     node = make_node(words=("--params-file", str(file), "-r", f"__node:={name}"))
-    rows = {row.name: row for row in NODES[name]().parameters}
+    rows = {row.name: row for row in describe_node(name).parameters}
     for given, parameter in node.given.items():
         if given == runner.SHARED and given not in rows:
             continue

@@ -7,10 +7,9 @@ from pathlib import Path
 import pytest
 
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.nodes import node_process
+from nics_drl_bridge.nodes import processes
 from nics_drl_bridge.nodes.listener import holds
-from nics_drl_bridge.nodes.node_process import ChildProcess
-from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.processes import ChildProcess, NodeProcess, free_domain_id
 
 pytestmark = [pytest.mark.ros, pytest.mark.process]
 
@@ -24,7 +23,7 @@ time.sleep(600)
 """
 PARENT = f"""
 import sys
-from nics_drl_bridge.nodes.node_process import ChildProcess
+from nics_drl_bridge.nodes.processes import ChildProcess
 with ChildProcess("child", [sys.executable, "-c", {HANG!r}]) as child:
     print(child.pid, flush=True)
     sys.stdin.read()
@@ -63,7 +62,7 @@ def test_a_node_dies_with_its_parent_however_that_dies():
 
 
 def test_leaving_the_block_ends_a_node_that_hangs(tmp_path, monkeypatch):
-    monkeypatch.setattr(node_process, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(processes, "PATIENCE_S", 0.5)
     log = tmp_path / "log"
     command = [sys.executable, "-c", HANG]
     with ChildProcess("child", command, log=log) as child:
@@ -80,12 +79,12 @@ def test_a_node_that_ended_by_itself_is_named_with_its_code_and_log(
     for name in ("yaml", "numpy", "numba", "rclpy"):
         (tmp_path / f"{name}.py").write_text(f"open({str(canary)!r}, 'w')\n")
     monkeypatch.chdir(tmp_path)
-    wrong = {"policy": "dynamic_widow"}
-    with NodeProcess("policy_node", tmp_path / "log", wrong, domain_id) as node:
+    wrong = {"robot": "differntial"}
+    with NodeProcess("record_node", tmp_path / "log", wrong, domain_id) as node:
         wait_for(lambda: node.poll() is not None, "its end")
         expected = (
-            "policy_node ended with code 2: unknown policy 'dynamic_widow'; did you mean "
-            f"'dynamic_window'? (its log is {node.log})."
+            "record_node ended with code 2: unknown robot 'differntial'; did you mean "
+            f"'differential'? (or give the path of a YAML file). (its log is {node.log})."
         )
         with pytest.raises(BackendError, match=f"^{re.escape(expected)}$"):
             node.check()

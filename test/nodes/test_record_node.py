@@ -1,8 +1,6 @@
 import os
 import re
 import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -211,39 +209,26 @@ def test_a_robot_that_can_not_be_driven_is_not_moved(
     assert os.listdir() == []
 
 
-@pytest.mark.process
 def test_ctrl_c_on_the_command_line_saves_a_bag_and_tells_what_it_holds(
-    meet, domain_id, tmp_path
+    interrupt, meet, domain_id, tmp_path
 ):
     pytest.importorskip("rosbags")
     robot = FakeRobot(meet(domain_id))
-    cli = [sys.executable, "-m", "nics_drl_bridge.commands.cli", "record", "--yes"]
-    words = ["--robot", "ackermann", "--out", "drive", "--duration", "20"]
-    with (tmp_path / "said").open("w+", encoding="utf-8") as log:
-        command = subprocess.Popen(
-            [*cli, *words],
-            cwd=tmp_path,
-            env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
-            stdout=log,
-            stderr=log,
-        )
-        try:
-            robot.until(lambda: robot.driven, "it drives")
-            begin = time.monotonic()
-            robot.until(lambda: time.monotonic() - begin > 2.0, "it drives on")
-            command.send_signal(signal.SIGINT)
-            robot.until(lambda: command.poll() is not None, "it ends")
-        finally:
-            command.kill()
-            command.wait()
-        log.seek(0)
-        told = log.read()
-    assert command.returncode == 130, told
+
+    def play():
+        robot.until(lambda: robot.driven, "it drives")
+        begin = time.monotonic()
+        robot.until(lambda: time.monotonic() - begin > 2.0, "it drives on")
+
+    words = "record --yes --robot ackermann --out drive --duration 20"
+    done = interrupt(play, words)
+    told = done.stdout + done.stderr
+    assert done.returncode == 130, told
     robot.peer.until(lambda: robot.heard[-1] == Twist(), "zero")
     assert "interrupted: the robot was told to stop; " in told
     assert "s are recorded in drive\n" in told
     assert "steering_command: " in told
-    assert set(os.listdir(tmp_path)) == {"said", "drive", "drive_preview.png"}
+    assert set(os.listdir(tmp_path)) == {"drive", "drive_preview.png"}
     assert seconds(tmp_path / "drive") > 0.5
 
 

@@ -341,7 +341,7 @@ def test_the_map_is_that_of_the_episode_and_changes_with_it(simulate, model):
         assert simulated.robot.set_to(episode_seed=seed).successful
         simulated.node.begin()
         for _ in range(2):  # only what is new is published
-            simulated.node._world_topics._look()
+            simulated.node.map_topic.look()
         scene = standing(sampler, 0, sampler.draw([seed])[0].bodies)
         wanted = occupancy(world, scene, 0.02)
         found = conversions.map_from_ros(maps[-1])
@@ -455,7 +455,7 @@ def fleet(make_node, model_folder):
 
 
 def command(node, robot, speed):
-    node._on_command(node._ports[robot], np.array([speed, 0.0]))
+    node.take_command(node._ports[robot], np.array([speed, 0.0]))
 
 
 def test_a_fleet_in_lock_step_keeps_its_commands_where_a_robot_joins(fleet):
@@ -504,7 +504,7 @@ def test_a_fleet_in_lock_step_goes_on_where_the_robot_that_it_waited_for_leaves(
     fleet.settle()
     assert node.now_ns == began_ns + PERIOD_NS
     assert node.device.commands[:, 0].tolist() == [0.25]
-    node._on_command(left, np.array([0.5, 0.0]))  # which had arrived before it left
+    node.take_command(left, np.array([0.5, 0.0]))  # which had arrived before it left
     fleet.settle()
     assert node.now_ns == began_ns + PERIOD_NS
 

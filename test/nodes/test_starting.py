@@ -8,7 +8,13 @@ from nics_drl_bridge.config import find_config, share_folder
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model, save_model
 from nics_drl_bridge.nodes import starting
-from nics_drl_bridge.nodes.starting import LAUNCHES, Robot, Setup, names_of, numbers_of
+from nics_drl_bridge.nodes.starting import (
+    LAUNCHES,
+    Robot,
+    Setup,
+    parse_robots,
+    parse_start,
+)
 
 
 def setup_of(**given):
@@ -30,15 +36,15 @@ def setup_of(**given):
     ],
 )
 def test_robots_are_a_count_or_names(robots, names):
-    assert names_of(robots) == names
+    assert parse_robots(robots) == names
 
 
 @pytest.mark.parametrize("name", starting.FLAGS)
 def test_a_flag_that_is_neither_true_nor_false_is_refused_before_any_node_starts(name):
     with pytest.raises(ConfigError, match=f"'{name}' is 'maybe'"):
         setup_of(**{name: "maybe"})
-    for word, value in (("True", "true"), ("0", "false"), ("", "")):
-        assert setup_of(**{name: word})[name] == value
+    for word, value in (("True", True), ("0", False), ("", None)):
+        assert setup_of(**{name: word})[name] is value
 
 
 def test_the_policies_of_a_fleet_hear_the_map_of_all():
@@ -50,7 +56,7 @@ def test_the_policies_of_a_fleet_hear_the_map_of_all():
 
 @pytest.mark.parametrize("start", ["1 0 1.5", "[1, 0, 1.5]", "1.0,0.0,1.5"])
 def test_a_start_is_three_numbers_in_any_spelling(start):
-    assert numbers_of(start) == [1.0, 0.0, 1.5]
+    assert parse_start(start) == [1.0, 0.0, 1.5]
 
 
 def test_one_robot_lies_in_the_namespace_and_a_fleet_below_it():
@@ -63,15 +69,15 @@ def test_one_robot_lies_in_the_namespace_and_a_fleet_below_it():
 
 
 def test_limits_and_looks_are_those_of_the_model_that_is_given(tmp_path):
-    assert setup_of().limits() == ""
-    assert setup_of(model="mecanum").limits() == "mecanum"
-    assert setup_of(model="mecanum", limits="own.yaml").limits() == "own.yaml"
+    assert setup_of().choose_limits() == ""
+    assert setup_of(model="mecanum").choose_limits() == "mecanum"
+    assert setup_of(model="mecanum", limits="own.yaml").choose_limits() == "own.yaml"
     save_model(builtin_model("mecanum"), tmp_path / "model")
     frames = {"base_frame": "chassis", "laser_frame": "front_laser"}
     generated = setup_of(model=str(tmp_path / "model"), **frames)
-    assert generated.limits() == "mecanum"
+    assert generated.choose_limits() == "mecanum"
     for setup in (generated, setup_of(model="mecanum", **frames)):
-        drawn = setup.description()
+        drawn = setup.describe_robot()
         assert '<robot name="mecanum"' in drawn
         assert '<link name="chassis">' in drawn
         assert '<link name="front_laser">' in drawn
@@ -82,11 +88,11 @@ def test_a_robot_of_an_own_file_of_parameters_is_named_where_it_is_described(tmp
     file = tmp_path / "own.yaml"
     file.write_text("/**:\n  ros__parameters:\n    model: jackal\n")
     with pytest.raises(ConfigError, match="say model:=ROBOT or urdf:=FILE"):
-        setup_of(params_file=str(file)).description()
-    drawn = setup_of(params_file=str(file), model="jackal").description()
+        setup_of(params_file=str(file)).describe_robot()
+    drawn = setup_of(params_file=str(file), model="jackal").describe_robot()
     assert '<robot name="jackal"' in drawn
-    assert '<robot name="differential"' in setup_of().description()
-    nodes = LAUNCHES["vehicle"]().nodes(
+    assert '<robot name="differential"' in setup_of().describe_robot()
+    nodes = LAUNCHES["vehicle"].nodes(
         {"params_file": str(file), "use_robot_state_pub": "false"}
     )
     assert {node.params_file for node in nodes} == {str(file)}
@@ -94,7 +100,7 @@ def test_a_robot_of_an_own_file_of_parameters_is_named_where_it_is_described(tmp
 
 def started(launch, **given):
     """Return the parameters of the nodes of a launch, by their names with namespaces."""
-    nodes = LAUNCHES[launch]().nodes(given)
+    nodes = LAUNCHES[launch].nodes(given)
     return {
         f"{node.namespace}/{node.executable}".strip("/"): node.parameters
         for node in nodes
@@ -149,7 +155,7 @@ def test_dart_simulates_the_robot_of_a_urdf_file(tmp_path):
 
 
 def test_rviz_shows_the_first_robot():
-    nodes = LAUNCHES["fleet"]().nodes({"rviz": "true"})
+    nodes = LAUNCHES["fleet"].nodes({"rviz": "true"})
     (view,) = [node for node in nodes if node.package == starting.RVIZ]
     assert view.namespace == "robot1"
     assert view.arguments[0] == "-d"
@@ -163,7 +169,7 @@ def test_every_launch_file_starts_the_launch_of_its_name():
     files = {file.name.partition(".")[0]: file for file in folder.glob("*.launch.py")}
     assert files.keys() == LAUNCHES.keys()
     for name, file in files.items():
-        assert f'describe(LAUNCHES["{name}"]())' in file.read_text(encoding="utf-8")
+        assert f'describe(LAUNCHES["{name}"])' in file.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from nics_drl_bridge.nodes.parameters import NODES
+from nics_drl_bridge.nodes.parameters import describe_node, list_nodes
 from nics_drl_bridge.nodes.start import find_fault, format_help
 
 # As where no ROS 2 is installed: what is imported in vain is missed.
@@ -32,10 +32,10 @@ def test_help_is_told_without_ros_and_ends_well():
     assert done.stdout == format_help("policy_node")
 
 
-@pytest.mark.parametrize("node", NODES)
+@pytest.mark.parametrize("node", list_nodes())
 def test_help_names_each_parameter_with_its_default_and_an_example(node):
     text = format_help(node)
-    for row in NODES[node]().parameters:
+    for row in describe_node(node).parameters:
         assert f"\n    {row.name} = " in text
     assert f"ros2 run nics_drl_bridge {node} --ros-args -p " in text
     assert max(map(len, text.splitlines())) <= 100

@@ -10,8 +10,7 @@ from nics_drl_bridge.extras.dart.simulator import PHYSICS, DartSimulator
 from nics_drl_bridge.extras.physics.machines import design_machine
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.nodes.device_parameters import get_randomisation
-from nics_drl_bridge.nodes.parameters import FRICTION, GYRO_BIAS, GYRO_NOISE, URDF
-from nics_drl_bridge.nodes.runner import declare_row, run_node
+from nics_drl_bridge.nodes.runner import declare_rows, run_node
 from nics_drl_bridge.nodes.simulator_node import DeviceNode
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -26,15 +25,13 @@ def dart_simulator(
     node: Node, model: SimulatorModel, world: AnyWorld, robots: int
 ) -> DartSimulator:
     """Makes robots in DART, with the floor, gyro and robot of the node's parameters."""
-    rows = {
-        row.name: declare_row(node, row) for row in (FRICTION, GYRO_BIAS, GYRO_NOISE)
-    }
-    file = declare_row(node, URDF)
+    physics = declare_rows(node, "physics", "gyro")
+    file = declare_rows(node, "urdf")["urdf"]
     return DartSimulator(
         model,
         world,
         robots,
-        replace(PHYSICS, **rows),
+        replace(PHYSICS, **physics),
         get_randomisation(node),
         Path(file) if file else None,
     )

@@ -10,8 +10,7 @@ from nics_drl_bridge.extras.mujoco.simulator import PHYSICS, MujocoSimulator
 from nics_drl_bridge.extras.physics.machines import design_machine
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.nodes.device_parameters import get_randomisation
-from nics_drl_bridge.nodes.parameters import FRICTION
-from nics_drl_bridge.nodes.runner import declare_row, run_node
+from nics_drl_bridge.nodes.runner import declare_rows, run_node
 from nics_drl_bridge.nodes.simulator_node import DeviceNode, declare_renderer
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -27,7 +26,7 @@ def mujoco_simulator(
 ) -> MujocoSimulator:
     """Makes robots in MuJoCo, with the lidar and floor of the node's parameters."""
     renderer = declare_renderer(node, defaults.MUJOCO_RENDERER)
-    physics = replace(PHYSICS, friction=declare_row(node, FRICTION))
+    physics = replace(PHYSICS, friction=declare_rows(node, "physics")["friction"])
     return MujocoSimulator(
         model, world, robots, renderer, physics, get_randomisation(node)
     )

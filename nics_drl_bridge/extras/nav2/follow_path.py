@@ -26,7 +26,6 @@ from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.frames import GoalFrames
-from nics_drl_bridge.nodes.parts import Wish
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.policy.follow import (
     GoalChecker,
@@ -155,7 +154,7 @@ class PathActions:
         topics: RobotTopics,
         frames: GoalFrames,
         model: SimulatorModel,
-        drive: Callable[[Array], Wish],
+        drive: Callable[[Array], runner.Wish],
         reset_policy: Callable[[], None],
     ) -> None:
         """Serve the actions until `close`.

@@ -9,8 +9,8 @@ from typing import Any
 from rclpy.node import Node
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.nodes.parameters import list_checker_rows, list_nav2_rows
-from nics_drl_bridge.nodes.runner import declare_row, get_text
+from nics_drl_bridge.nodes.parameters import list_checker_rows
+from nics_drl_bridge.nodes.runner import declare_row, declare_rows, get_text
 from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
 
 # Parameters for Nav2's own plugins, or for a control loop; a policy answers scans instead.
@@ -38,7 +38,7 @@ class ControllerParameters:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        values = {row.name: declare_row(node, row) for row in list_nav2_rows()}
+        values = declare_rows(node, "nav2")
         self.names = {kind: tuple(values[f"{kind}_plugins"] or ()) for kind in KINDS}
         empty = [kind for kind, names in self.names.items() if not names]
         if empty:

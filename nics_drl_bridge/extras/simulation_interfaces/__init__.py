@@ -3,7 +3,9 @@
 from typing import TYPE_CHECKING, Any
 
 from nics_drl_bridge.nodes import conversions, runner
-from nics_drl_bridge.nodes.parameters import NEWEST, STANDARD
+
+# This service exists since simulation_interfaces 2.1, the oldest supported version.
+NEWEST = "simulation_interfaces/srv/SpawnEntities"
 
 if TYPE_CHECKING:
     from nics_drl_bridge.extras.simulation_interfaces.server import Server
@@ -11,7 +13,7 @@ if TYPE_CHECKING:
 
 def open_services(node: Any) -> "Server | None":
     """Offer the standard services at a device node; None without its messages, or if unwanted."""
-    if not runner.declare_row(node, STANDARD):
+    if not runner.get_flag(node, "simulation_interfaces"):
         return None
     if conversions.find_message_type(NEWEST) is None:
         missing = "the package simulation_interfaces, 2.1 or newer, is not installed"

@@ -27,6 +27,8 @@ REACH = 10.0  # limit of a twist set on a robot, as a multiple of its maximum co
 class UnknownEntityError(BridgeError):
     """No entity has that name."""
 
+    code = 2  # RESULT_NOT_FOUND of the standard
+
 
 class StillError(BridgeError):
     """A twist was requested for an entity that stands still."""

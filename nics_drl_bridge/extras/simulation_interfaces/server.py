@@ -10,12 +10,12 @@ from nics_drl_bridge.extras.simulation_interfaces.entities import (
     FORMATS,
     EntityServices,
 )
-from nics_drl_bridge.extras.simulation_interfaces.host import (
+from nics_drl_bridge.extras.simulation_interfaces.state import (
     Handler,
     RefusalError,
+    Simulation,
     served,
 )
-from nics_drl_bridge.extras.simulation_interfaces.state import Simulation
 from nics_drl_bridge.nodes import conversions
 
 FEATURES = (

@@ -1,20 +1,36 @@
-"""The simulation: playing, paused, stopped; its steps, resets, and worlds."""
+"""The simulation: playing, paused, stopped; its steps, resets, and worlds.
 
-from typing import Any
+Its services are answered by the node that offers them, with a code of the standard.
+"""
 
-from simulation_interfaces.msg import Resource, Result, SimulationState, WorldResource
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+from urllib.parse import unquote, urlsplit
+
+from simulation_interfaces.msg import (
+    Resource,
+    Result,
+    SimulationState,
+    SpawnResult,
+    WorldResource,
+)
 from simulation_interfaces.srv import LoadWorld, ResetSimulation, SetSimulationState
 
-from nics_drl_bridge.errors import BridgeError
-from nics_drl_bridge.extras.simulation_interfaces.host import (
-    Host,
-    RefusalError,
-    find_local_path,
-    refused,
+from nics_drl_bridge.errors import (
+    BridgeError,
+    ConfigError,
+    MissingFileError,
+    UnknownNameError,
 )
 from nics_drl_bridge.extras.simulation_interfaces.roster import Entities
 from nics_drl_bridge.nodes import runner
+from nics_drl_bridge.sim.sdf import AssetsError
 from nics_drl_bridge.sim.world_set import SPECIAL, load_worlds
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.nodes.simulator_node import DeviceNode
 
 STOPPED = SimulationState.STATE_STOPPED
 PLAYING = SimulationState.STATE_PLAYING
@@ -26,6 +42,78 @@ GOODBYE_S = 0.2  # until the answer to who ended the simulation has left
 SCOPES = ResetSimulation.Request
 EVERY_SCOPE = SCOPES.SCOPE_TIME | SCOPES.SCOPE_STATE | SCOPES.SCOPE_SPAWNED
 CODES = LoadWorld.Response
+
+# the device node that offers the services
+Host: TypeAlias = "DeviceNode"
+Handler = Callable[[Any, Any], None]
+# A service's message whose constants are its codes for resources that it can't use.
+Codes = type[SpawnResult] | type[LoadWorld.Response]
+
+
+class RefusalError(BridgeError):
+    """A request that is answered by a code of the standard and one sentence."""
+
+    def __init__(self, code: int, sentence: str) -> None:
+        super().__init__(sentence)
+        self.code = code
+
+
+def served(handler: Handler, host: Host) -> Callable[[Any, Any], Any]:
+    """Return a service's callback, which answers whether a handler succeeds or why it does not."""
+
+    def reply(request: Any, response: Any) -> Any:
+        code = Result.RESULT_OK
+        sentence = ""
+        try:
+            handler(request, response)
+        except BridgeError as error:
+            code = getattr(error, "code", Result.RESULT_OPERATION_FAILED)
+            sentence = str(error)
+        except OSError as error:
+            code = Result.RESULT_NOT_FOUND
+            sentence = str(BridgeError(f"{error}; check the path."))
+        except Exception as error:  # noqa: BLE001  (the other robots and clients go on)
+            code = Result.RESULT_OPERATION_FAILED
+            fault = f"the simulator failed: {type(error).__name__}: {error}"
+            host.get_logger().error(fault)
+            sentence = " ".join(fault.split())
+        response.result.result = code
+        response.result.error_message = sentence
+        return response
+
+    return reply
+
+
+def find_local_path(uri: str, codes: Codes, formats: tuple[str, ...]) -> Path:
+    """Return the path that a URI or a plain path means, or a name. Raises RefusalError."""
+    fault = "is not on this machine; give file:// or a path"
+    place = uri
+    try:
+        parts = urlsplit(uri)
+    except ValueError:  # of a host that is none
+        parts = None
+    if parts and parts.scheme == "file" and parts.netloc in ("", "localhost"):
+        place = unquote(parts.path)
+    path = Path(place)
+    if parts and "://" not in place:
+        if path.suffix in ("", *formats) or path.is_dir():
+            return path
+        fault = f"is none of {', '.join(formats)}; convert it"
+    raise RefusalError(codes.UNSUPPORTED_FORMAT, f"uri {uri!r}: {fault}.")
+
+
+@contextmanager
+def refused(codes: Codes) -> Iterator[None]:
+    """Within this context, a resource that can't be used raises RefusalError with its code."""
+    try:
+        yield
+    except AssetsError as error:
+        code = codes.MISSING_ASSETS if error.missing else codes.UNSUPPORTED_ASSETS
+        raise RefusalError(code, str(error)) from None
+    except (MissingFileError, UnknownNameError) as error:
+        raise RefusalError(Result.RESULT_NOT_FOUND, str(error)) from None
+    except ConfigError as error:
+        raise RefusalError(codes.RESOURCE_PARSE_ERROR, str(error)) from None
 
 
 class Simulation:

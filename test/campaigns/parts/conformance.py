@@ -13,7 +13,7 @@ from geometry_msgs.msg import PoseStamped
 from simulation_interfaces import msg, srv
 
 from nics_drl_bridge.extras.simulation_interfaces.server import snake_case
-from nics_drl_bridge.nodes.spun_node import SpunNode
+from nics_drl_bridge.nodes.listener import SpunNode
 
 OK = msg.Result.RESULT_OK
 UNSUPPORTED = msg.Result.RESULT_FEATURE_UNSUPPORTED

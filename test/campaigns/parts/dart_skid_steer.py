@@ -28,7 +28,7 @@ from nics_drl_bridge.extras.physics.scenery import Box, Cylinder
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.spun_node import SpunNode
+from nics_drl_bridge.nodes.listener import SpunNode
 
 STEP_S = 0.002
 WHEEL_RADIUS = 0.165  # [m]

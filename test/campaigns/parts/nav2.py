@@ -15,8 +15,8 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from nics_drl_bridge.nodes import qos
+from nics_drl_bridge.nodes.listener import SpunNode
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
-from nics_drl_bridge.nodes.spun_node import SpunNode
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.occupancy import occupancy, standing
 from nics_drl_bridge.sim.scenes import SceneSampler

@@ -16,7 +16,7 @@ from rclpy.action import ActionClient
 
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.spun_node import SpunNode
+from nics_drl_bridge.nodes.listener import SpunNode
 from nics_drl_bridge.policy.route import route
 
 DEADLINE_S = 300.0

@@ -253,12 +253,6 @@ def test_poses_may_be_given_in_the_frame_of_an_entity(client):
             "leave out all else",
         ),
         (
-            "GetEntities",
-            {"filters": msg.EntityFilters(filter="(a*)*")},
-            4,
-            "repeat no group",
-        ),
-        (
             "LoadWorld",
             {"world_resource": msg.Resource(resource_string="name: x")},
             0,
