@@ -296,7 +296,7 @@ def record_stops():
             points = rng.uniform(-1.0, 1.0, (40, 1, 3)) * (1.0, 1.0, 0.5)
             points[::2, :, 2] = 0.0
             free += [
-                shield_kernels.is_free(point, twist[None], *stop, 0.02)
+                shield_kernels.is_free(point, twist[None], stop, 0.02)
                 for point in points
                 for twist in twists
             ]
