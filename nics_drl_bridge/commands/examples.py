@@ -1,6 +1,10 @@
-"""Examples at the end of each command's help."""
+"""The help of each command: its options, as its docstring describes them, and examples."""
+
+import re
+from typing import Any
 
 import typer
+from typer.core import TyperCommand
 
 from nics_drl_bridge.commands.console import check_options
 
@@ -65,9 +69,22 @@ EXAMPLES = {
 }
 
 
+class DocumentedCommand(TyperCommand):
+    """Takes the help of its options from the section `Args` of its docstring."""
+
+    def __init__(self, *words: Any, help: str, params: list[Any], **options: Any):
+        text, _, section = help.partition("\n\nArgs:\n")
+        lines = re.findall(r"^    (\w+): (.+(?:\n {5,}.+)*)", section, re.MULTILINE)
+        about = {name: " ".join(line.split()) for name, line in lines}
+        for param in params:
+            param.help = param.help or about.get(param.name)
+        super().__init__(*words, help=text, params=params, **options)
+
+
 def complete(app: typer.Typer, group: str = "") -> None:
-    """Adds `check_options` and examples in the help to each command of an app and its groups."""
+    """Adds `check_options`, and what its help needs, to each command of an app and its groups."""
     for command in app.registered_commands:
+        command.cls = DocumentedCommand
         command.callback = check_options(command.callback) if command.callback else None
         name = command.name or str(getattr(command.callback, "__name__", ""))
         examples = EXAMPLES.get(f"{group}{name}")
