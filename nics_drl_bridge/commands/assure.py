@@ -57,6 +57,10 @@ def assure(
         control: Run everything without the gate, as a control that must find failures.
         replay: Only repeat this episode of a run.
         out: Folder for all output; an existing run is continued.
+
+    Examples:
+        nics assure differential --limits differential --episodes 300
+        nics assure my.onnx --limits my_limits.yaml --out runs/evidence
     """
     check_above(out / PAGE)
     with console.show_progress("opening robot and policy"):

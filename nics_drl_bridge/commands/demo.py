@@ -31,6 +31,10 @@ def demo(
         episodes: Episodes in process, and again over DDS.
         policy: Skip training: use a policy file, a shipped one or a baseline.
         train_steps: Environment steps to train.
+
+    Examples:
+        nics demo
+        nics demo --recording drive.npz --robot my_robot.yaml
     """
     from nics_drl_bridge.commands.demo_report import DemoPlan
     from nics_drl_bridge.commands.demo_run import Demo

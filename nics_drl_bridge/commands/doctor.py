@@ -40,6 +40,11 @@ def doctor(
         duration: Time to listen to a robot [s].
         install: Check this machine instead: which features work here.
         load: Measure a vehicle's nodes on this machine instead.
+
+    Examples:
+        nics doctor --install
+        nics doctor drive_bag --model my_robot
+        nics doctor --policy policy.onnx --namespace robot1
     """
     if install:
         _tell_installation(as_json)
@@ -151,6 +156,9 @@ def explain(
 
     Args:
         file: Black box written at a stop, *.jsonl.
+
+    Examples:
+        nics explain ~/.ros/black_box/stop.jsonl
     """
     from nics_drl_bridge.gate import black_box
 

@@ -77,6 +77,10 @@ def evaluate(
         pose_type: For --hardware: type of `pose`, in map.
         yes: For --hardware: ask no questions.
         arm: For --hardware: arm command_gate.
+
+    Examples:
+        nics evaluate differential dynamic_window --world circles --in fast
+        nics evaluate runs/mine/seed_0/policy.onnx --world doorway --episodes 100
     """
     place = _parse_point(goal)
     if backend not in (None, "dds"):

@@ -39,6 +39,10 @@ def install(
         packages: tf2_msgs, ackermann_msgs, or the folder of another package with its msg, srv and
             action.
         prefix: Folder to install into, with a setup.bash to source; by default this environment.
+
+    Examples:
+        nics install tf2_msgs
+        nics install tf2_msgs --prefix messages
     """
     from nics_drl_bridge.commands.message_build import (
         Generators,

@@ -20,6 +20,10 @@ def list_(what: Listed, as_json: JsonOption = False) -> None:
 
     Args:
         what: What to list.
+
+    Examples:
+        nics list robots
+        nics list worlds --json
     """
     rows = ROWS[what]()
     cells = [tuple(map(str, row.values())) for row in rows]

@@ -58,6 +58,10 @@ def record(
         stamped: Send cmd_vel as TwistStamped.
         preview: Only show the planned drive.
         yes: Do not ask before the robot moves.
+
+    Examples:
+        nics record --robot my_robot.yaml --out drive.npz --preview
+        nics record --robot my_robot.yaml --out drive.npz --bound 2 --speed 0.3
     """
     arguments = make_node_arguments(namespace, remap or ())
     parameters = {
@@ -159,6 +163,9 @@ def inspect(
 
     Args:
         mapping: YAML file to write: a draft mapping, with guesses.
+
+    Examples:
+        nics inspect drive.csv --map drive.yaml
     """
     from nics_drl_bridge.files import write_text
     from nics_drl_bridge.recording.mapping_draft import propose_mapping
@@ -228,6 +235,9 @@ def import_(
     Args:
         mapping: YAML mapping, docs/recordings.md.
         out: The .npz file to write.
+
+    Examples:
+        nics import drive.csv --map drive.yaml --out drive.npz
     """
     from nics_drl_bridge.recording.readers import read_recording
     from nics_drl_bridge.recording.recording import save_recording
@@ -238,7 +248,7 @@ def import_(
     with console.show_progress(f"reading {source}"):
         drive = read_recording(source, mapping=mapping)
         save_recording(drive, out)
-    streams = [
+    streams: list[dict[str, Any]] = [
         {
             "stream": name,
             "rows": len(s.t),
@@ -301,6 +311,10 @@ def generate(
         strict: Fail if an input was not varied independently.
         anyway: Write the model even if it predicts unseen data badly.
         pictures: Draw the fit into the model's pictures/.
+
+    Examples:
+        nics generate drive.npz --robot ackermann --out my_robot
+        nics generate drive.csv --map drive.yaml --out my_robot
     """
     from nics_drl_bridge.generator import check_place, mount_lidar, save_model
     from nics_drl_bridge.generator import generate as generate_model
@@ -401,6 +415,9 @@ def drive(
         lidar: A shipped lidar or a YAML file; else the robot's own, or paper.
         duration: Duration [s].
         seed: Seed of the random commands.
+
+    Examples:
+        nics drive --robot my_robot.yaml --out my_robot
     """
     import numpy as np
 
@@ -442,6 +459,9 @@ def urdf(
     Args:
         model: A shipped robot, or the folder of a model.
         out: File to write; by default <robot>.urdf.
+
+    Examples:
+        nics urdf my_robot --out my_robot.urdf
     """
     from nics_drl_bridge.files import write_text
     from nics_drl_bridge.generator import open_model

@@ -30,6 +30,10 @@ def arm(
 
     Args:
         reset: First release a latched stop, for example of nics stop.
+
+    Examples:
+        nics arm
+        nics arm --reset --namespace ant
     """
     parse_namespace(namespace)
     with extensions.require_modules("nics arm"):
@@ -52,6 +56,10 @@ def stop(
 
     Args:
         namespace: Namespace of the robot to stop; by default all robots are stopped.
+
+    Examples:
+        nics stop
+        nics stop --namespace ant
     """
     parse_namespace(namespace or "")
     with extensions.require_modules("nics stop"):
@@ -94,6 +102,10 @@ def goal(
         y: To the left, along its y axis [m].
         yaw: Heading at the goal [rad]; policies of this package ignore it.
         frame: Frame of the goal: map (default), odom, base_link, ...
+
+    Examples:
+        nics goal 1 0
+        nics goal 2 -0.5 --frame base_link --namespace ant
     """
     parse_namespace(namespace)
     with extensions.require_modules("nics goal"):

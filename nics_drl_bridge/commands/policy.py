@@ -31,6 +31,9 @@ def info(
 
     Args:
         file: A policy file, the name of a shipped one, or a foreign one's mapping.
+
+    Examples:
+        nics policy info differential --json
     """
     from nics_drl_bridge.policy.file.policy_file import load_policy, summary
 
@@ -52,6 +55,9 @@ def export(
 
     Args:
         leapp: Folder of the bundle: network, YAML file, start values.
+
+    Examples:
+        nics policy export policy.onnx --leapp bundle
     """
     from nics_drl_bridge.policy.file.policy_file import foreign_policies, load_policy
 
@@ -72,6 +78,9 @@ def import_(
         source: A LEAPP bundle, or the mapping (YAML) of a foreign policy.
         out: The policy file to write (*.onnx).
         robot: A shipped robot, or the folder of a model.
+
+    Examples:
+        nics policy import bundle --robot my_robot --out policy.onnx
     """
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.file.contract import SUFFIX

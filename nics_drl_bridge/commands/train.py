@@ -63,6 +63,10 @@ def train(
         address: Ray cluster: auto (this machine's) or HOST:PORT; else a new one.
         env_runners: Ray processes that share the worlds; default: one per CPU.
         watch: Show some of the worlds on a page, as nics watch does.
+
+    Examples:
+        nics train --robot differential --world circles --out runs/first
+        nics train --robot my_robot.yaml --world doorway --out runs/mine
     """
     named = _keep_given(
         robot=robot,
@@ -73,8 +77,11 @@ def train(
     )
     if resume:
         _check_resumed(out, bool(settings), named)
-    if watch:
-        _check_watched(engine)
+    if watch and engine not in (None, *OWN):
+        raise ConfigError(
+            f"--watch --engine {engine}: worlds of other processes are not shown; "
+            "leave out --watch, or --engine."
+        )
     further_seeds = seeds_of_words(more_seeds or [], seeds is not None)
     check_training(task, robot, world or [], [*(seeds or []), *further_seeds], out)
     check_engine(engine, {"address": address, "env-runners": env_runners})
@@ -124,15 +131,6 @@ def train(
 def _keep_given(**options: object) -> dict[str, Any]:
     """Returns the options that were given."""
     return {name: value for name, value in options.items() if value}
-
-
-def _check_watched(engine: str | None) -> None:
-    """Raises ConfigError for an engine whose worlds can't be shown."""
-    if engine is not None and engine not in OWN:
-        reason = (
-            "worlds of other processes are not shown; leave out --watch, or --engine"
-        )
-        raise ConfigError(f"--watch --engine {engine}: {reason}.")
 
 
 def _check_resumed(

@@ -42,6 +42,11 @@ def up(
     Args:
         arguments: Arguments, the same as those of the launch files.
         show_args: List the arguments and their defaults; start nothing.
+
+    Examples:
+        nics up simulation world:=corridor
+        nics up fleet robots:='[ant, bee]'
+        nics up vehicle model:=my_car params_file:=car.yaml
     """
     if what not in LAUNCHES:
         raise ConfigError(f"nics up can't start {what!r}; {suggest(what, LAUNCHES)}")

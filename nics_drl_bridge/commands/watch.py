@@ -56,6 +56,11 @@ def watch(
         episodes: For --record: number of episodes.
         port: Port of the page; 0 takes any.
         browser: Open the page in a browser.
+
+    Examples:
+        nics watch differential --world circles
+        nics watch --bag drive
+        nics watch jackal --world clutter --record episode.gif
     """
     if record is None:  # first, because opening the source may take a while
         extensions.require("the page", "websockets")

@@ -105,6 +105,9 @@ def import_(
             several times.
         skip_unknown: For SDF: skip and list meshes and other unsupported shapes.
         resolution: For a picture: side of a pixel [m].
+
+    Examples:
+        nics world import house.world --out house.yaml
     """
     from nics_drl_bridge.sim.sdf import read_sdf
 
@@ -223,40 +226,33 @@ def _format_world(
 
     Raises ConfigError that names the imported file, because the new one does not exist yet.
     """
-    from nics_drl_bridge.config import dump_yaml
+    from nics_drl_bridge.config import dump_yaml, parse_yaml, validate
+    from nics_drl_bridge.sim.world import World, check_places
 
     far = round(math.hypot(*size), 3)
+    least = min(defaults.IMPORT_GOAL_DISTANCE_M, round(far / 4.0, 3))
     if {"starts", "goals"} <= set(values):
         least = 0.0
-    else:
-        least = min(defaults.IMPORT_GOAL_DISTANCE_M, round(far / 4.0, 3))
     values = {"goal_distance": (least, far), **values}
     comments = [f"# {' '.join(line.split())}\n" for line in head]
     ordered = {key: values[key] for key in KEYS if key in values}
     text = "".join(comments) + dump_yaml(ordered, one_line_rows=True)
     obstacles = sum(len(group["at"]) for group in values.get("obstacles", ()))
-    _read_back(file, text, obstacles)
-    return text
-
-
-def _read_back(file: Path, text: str, obstacles: int) -> None:
-    """Reads a world's text. Raises ConfigError that names the file from which it was made."""
-    from nics_drl_bridge.config import parse_yaml, validate
-    from nics_drl_bridge.sim.world import World, check_places
-
     made = f"{file}: the world made of it"
     try:
         data = parse_yaml(text, made)
     except ConfigError:
         if not obstacles:
             raise
-        reason = f"its {obstacles} bodies make a file that is too large to be read"
-        fix = "leave some out by --without MODEL, or split the world"
-        raise ConfigError(f"{file}: {reason}; {fix}.") from None
+        raise ConfigError(
+            f"{file}: its {obstacles} bodies make a file that is too large to be read; "
+            "leave some out by --without MODEL, or split the world."
+        ) from None
     world = validate(data, World, made)
     if world.map is None:
         world._file = made
         check_places(world)
+    return text
 
 
 @world.command()
@@ -277,6 +273,9 @@ def draw(
         seed: Seed of the episode.
         robot: A shipped robot (see nics list robots) or a YAML file.
         footprint: Radius of a round robot instead [m].
+
+    Examples:
+        nics world draw clutter --seed 3
     """
     with console.show_progress():
         from nics_drl_bridge.files import write_bytes
@@ -339,6 +338,9 @@ def map_(
         seed: Seed of the episode.
         robot: A shipped robot (see nics list robots) or a YAML file.
         resolution: Maximum side of a cell [m].
+
+    Examples:
+        nics world map room --out room_map.yaml
     """
     with console.show_progress():
         from nics_drl_bridge.lidar.maps import map_files

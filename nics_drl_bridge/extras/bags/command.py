@@ -42,23 +42,19 @@ def record(
         topics: A topic to record; repeatable.
         everything: Record every topic.
         duration: Stop after this time [s]; else at Ctrl-C.
+
+    Examples:
+        nics bag record drive --duration 60
     """
     with extensions.require_modules("nics bag record"):
         from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
         from nics_drl_bridge.nodes.own_process import forward_errors
     names = tuple(topics or ())
-    say = partial(typer.echo, err=True)
-    order = BagOrder(
-        out,
-        names,
-        everything,
-        parse_namespace(namespace),
-        duration,
-        storage,
-        use_sim_time,
-    )
+    space = parse_namespace(namespace)
+    order = BagOrder(out, names, everything, space, duration, storage, use_sim_time)
     with forward_errors():
-        counts = dict(sorted(record_bag(order, say).items()))
+        counts = record_bag(order, partial(typer.echo, err=True))
+    counts = dict(sorted(counts.items()))
     lines = [f"{topic}: {count} messages" for topic, count in counts.items()]
     lines.append(f"bag written to {out}")
     console.print_line(as_json, "\n".join(lines), path=str(out), messages=counts)
@@ -69,7 +65,11 @@ def info(
     path: BagArgument,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Shows a bag's topics, rates, gaps, and the clock of its stamps."""
+    """Shows a bag's topics, rates, gaps, and the clock of its stamps.
+
+    Examples:
+        nics bag info drive --json
+    """
     from nics_drl_bridge.extras.bags.info import read_bag_info
 
     contents = read_bag_info(path)
@@ -140,14 +140,17 @@ def replay(
         estimate: Run the middleware on the bag in process instead.
         model: For --estimate: folder of a model, or a shipped robot.
         out: For --estimate: .npz or .csv to write.
+
+    Examples:
+        nics bag replay drive --rate 2
     """
     if estimate:
         _replay_estimator(path, model, topic or [], out, as_json)
         return
     with extensions.require_modules("nics bag replay"):
-        from nics_drl_bridge.extras.bags.live import play_bag
-    say = partial(typer.echo, err=True)
-    sent = play_bag(path, topics or (), rate, loop, clock, namespace, lockstep, say)
+        from nics_drl_bridge.extras.bags.live import PlayOrder, play_bag
+    order = PlayOrder(path, topics or (), rate, loop, clock, namespace, lockstep)
+    sent = play_bag(order, partial(typer.echo, err=True))
     console.print_line(as_json, f"{sent} messages were published", published=sent)
 
 
@@ -163,6 +166,9 @@ def export(
     Args:
         mcap: Write an MCAP bag for Foxglove.
         model: A model's folder, or a shipped robot: for its lidar's mount.
+
+    Examples:
+        nics bag export drive --mcap shown --model my_robot
     """
     from nics_drl_bridge.extras.bags.convert import convert
     from nics_drl_bridge.generator import open_model
