@@ -13,30 +13,26 @@ from nics_drl_bridge.nodes.device_parameters import get_randomisation
 from nics_drl_bridge.nodes.parameters import FRICTION, GYRO_BIAS, GYRO_NOISE, URDF
 from nics_drl_bridge.nodes.runner import declare_row, run_node
 from nics_drl_bridge.nodes.simulator_node import DeviceNode
-from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-
-def check(robot: RobotSpec) -> None:
-    """Raises ConfigError for a robot without a machine."""
-    design_machine(robot, PHYSICS, "DART")
+# Raises ConfigError for a robot without a machine.
+check = partial(design_machine, physics=PHYSICS, engine="DART")
 
 
 def dart_simulator(
     node: Node, model: SimulatorModel, world: AnyWorld, robots: int
 ) -> DartSimulator:
     """Makes robots in DART, with the floor, gyro and robot of the node's parameters."""
-    rows = {
-        row.name: declare_row(node, row) for row in (FRICTION, GYRO_BIAS, GYRO_NOISE)
-    }
+    rows = (FRICTION, GYRO_BIAS, GYRO_NOISE)
+    given = {row.name: declare_row(node, row) for row in rows}
     file = declare_row(node, URDF)
     return DartSimulator(
         model,
         world,
         robots,
-        replace(PHYSICS, **rows),
-        get_randomisation(node),
-        Path(file) if file else None,
+        physics=replace(PHYSICS, **given),
+        randomisation=get_randomisation(node),
+        file=Path(file) if file else None,
     )
 
 
