@@ -53,7 +53,14 @@ def track_estimate(
     if state.estimate is None or not marks:  # nothing to compare it with
         return EstimateTrack((newest,), "", track.last_fault)
     fault = _find_jump(config, state.estimate, estimate, now - state.estimate_s)
-    fault = fault or _explain_uncertainty(config, marks[0], estimate, now)
+    position, heading = compute_growth(marks[0], estimate)
+    is_certain = position <= config.estimate_position
+    if not fault and not (is_certain and heading <= config.estimate_heading):
+        fault = (
+            f"it became uncertain by {position:.3g} m and {heading:.3g} rad in "
+            f"{now - marks[0].time_s:.1f} s, the limits are {config.estimate_position:g} m and "
+            f"{config.estimate_heading:g} rad"
+        )
     if fault:
         return EstimateTrack((newest,), fault, fault)
     if now - marks[-1].time_s >= ESTIMATE_MARK_S:
@@ -74,20 +81,6 @@ def _find_jump(
         return ""
     path, turn = moved
     return f"it jumped by {path:.3g} m and {turn:.3g} rad in {passed_s:.2f} s"
-
-
-def _explain_uncertainty(
-    config: GateConfig, origin: EstimateMark, estimate: Estimate, now: float
-) -> str:
-    """Returns the fault of an estimate that has become too uncertain, or ""."""
-    position, heading = compute_growth(origin, estimate)
-    if position <= config.estimate_position and heading <= config.estimate_heading:
-        return ""
-    return (
-        f"it became uncertain by {position:.3g} m and {heading:.3g} rad in "
-        f"{now - origin.time_s:.1f} s, the limits are {config.estimate_position:g} m and "
-        f"{config.estimate_heading:g} rad"
-    )
 
 
 def restart_track(state: GateState) -> EstimateTrack:

@@ -129,7 +129,8 @@ UNDECIDED = Verdict(math.nan, False)
 def watch_scan(config: GateConfig, state: GateState, scan: Scan) -> ScanMotion:
     """Returns what recent scans show of the motion, after a new scan."""
     before = state.scan_motion
-    if not _can_judge(config) or state.odometry is None:
+    is_judged = config.stop_when_held and len(config.beam_angles) >= 2
+    if not is_judged or state.odometry is None:
         return ScanMotion()
     newest = View(
         scan.stamp_ns,
@@ -168,11 +169,6 @@ def extrapolate_pose(odometry: Odometry, stamp_ns: int, longest_s: float) -> Arr
     """Returns the pose (3,) at a stamp near the newest odometry, extrapolated by its twist."""
     seconds = np.clip((stamp_ns - odometry.stamp_ns) * S_PER_NS, -longest_s, longest_s)
     return compose(odometry.pose, exp(seconds * odometry.twist))
-
-
-def _can_judge(config: GateConfig) -> bool:
-    """True if the rule is on, and the lidar has at least two beams."""
-    return config.stop_when_held and len(config.beam_angles) >= 2
 
 
 def _compute_memory_s(config: GateConfig) -> float:
@@ -247,6 +243,11 @@ def _compare_scans(
     mount = np.array(config.mount)
     moved = between(compose(reference.pose, mount), compose(newest.pose, mount))
     directions = get_directions(config)
+    # The change of a range is the difference of two medians, each of n ranges with normal noise:
+    # its standard deviation is sqrt(2) * sqrt(pi / 2) / sqrt(n) times theirs, and at most sqrt(2)
+    # times.
+    count = 2 * directions.half_window + 1
+    factor = math.sqrt(2.0) * min(1.0, MEDIAN_FACTOR / math.sqrt(count))
     predicted = np.empty_like(reference.ranges)
     kernels.predict_scan(reference.ranges, directions, moved, predicted)
     compared: tuple[Array, Array] = kernels.compare_sectors(
@@ -254,7 +255,7 @@ def _compare_scans(
         newest.ranges,
         predicted,
         round(SETTINGS.sector / directions.step) or 1,
-        compute_noise(config, directions),
+        Noise(*(factor * std for std in config.range_noise)),
     )
     return compared
 
@@ -343,18 +344,6 @@ def make_directions(config: GateConfig, size: int, half_window: int) -> Directio
         half_window=half_window,
         full_circle=beams * step > FULL_CIRCLE - 0.5 * step,
     )
-
-
-def compute_noise(config: GateConfig, directions: Directions) -> Noise:
-    """Returns the standard deviation of the change of a reduced range.
-
-    The change is the difference of two medians, each of n ranges with normal noise: its standard
-    deviation is sqrt(2) * sqrt(pi / 2) / sqrt(n) times theirs, and at most sqrt(2) times.
-    """
-    count = 2 * directions.half_window + 1
-    factor = math.sqrt(2.0) * min(1.0, MEDIAN_FACTOR / math.sqrt(count))
-    constant, proportional = config.range_noise
-    return Noise(factor * constant, factor * proportional)
 
 
 def warm_up(config: GateConfig) -> None:

@@ -329,11 +329,10 @@ def _span_car_twists(
         speeds.append(odometry[0])
         if abs(odometry[0]) > CURVATURE_SPEED:
             curvatures.append(odometry[2] / odometry[0])
-    low = min(curvatures)
-    high = max(curvatures)
-    count = CURVATURE_COUNT if high > low else 1
+    # none twice if the car drives straight
+    spanned = np.unique(np.linspace(min(curvatures), max(curvatures), CURVATURE_COUNT))
     extremes = [speed for speed in sorted({max(speeds), min(speeds)}) if speed != 0.0]
-    speed, curvature = np.meshgrid(extremes, np.linspace(low, high, count))
+    speed, curvature = np.meshgrid(extremes, spanned)
     twists = np.stack([speed, np.zeros_like(speed), speed * curvature], axis=-1)
     return twists.reshape(-1, 3)
 
