@@ -264,7 +264,7 @@ class FaultyDrive:
     def recover(self):
         """Has no fault any more, and is told to stand."""
         self.fault = "stopped"
-        self.run(32)
+        self.run(8)
 
 
 def record_drive(name, check=lambda drive, fault, stopped: None):
