@@ -186,7 +186,8 @@ def test_a_goal_lies_where_it_was_given_wherever_odometry_began(
 
     def drive(goal, frame=None):
         goals = GoalOrder(goal, frame, "present")
-        return vehicle.drive_vehicle(order, goals, said.append, said.append, **options)
+        drive = vehicle.VehicleDrive(order, goals, said.append, said.append)
+        return drive.run(**options)
 
     # In the map it is far away, which nobody has confirmed.
     far = r"\(2.00 m, 0.50 m\) in map, 16.\d+ m from where it stands, farther than 5 m.*use --yes"
@@ -268,14 +269,10 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(
     ):
         with Witness(domain_id) as witness:  # it may be compiling
             assert witness.sees(DEADLINE_S)
-        made = vehicle.drive_vehicle(
-            order,
-            GoalOrder(start="present"),
-            said.append,
-            said.append,
-            arm=True,
-            stale_after_s=DEADLINE_S,
+        drive = vehicle.VehicleDrive(
+            order, GoalOrder(start="present"), said.append, said.append, arm=True
         )
+        made = drive.run(stale_after_s=DEADLINE_S)
     assert "  command_gate is armed" in said
     assert any("it will drive to" in line for line in said)
     (driven,), (beside,) = made.runs.values()

@@ -30,53 +30,38 @@ COMPUTED_WITH = ("numpy", "numba", "scipy", "onnxruntime")
 
 def assure(
     policy: console.PolicyFileArgument,
-    limits: Annotated[
-        str,
-        Option(
-            autocompletion=console.complete_names("limits"),
-            help="The gate's limits: shipped ones (differential) or a YAML file.",
-        ),
-    ],
-    model: console.PolicyModelOption = None,
-    world: Annotated[
-        list[str] | None,
-        console.make_world_option(
-            "A shipped world or a YAML file; repeatable; arena, clutter and crowd."
-        ),
-    ] = None,
-    episodes: Annotated[
-        int, Option(min=1, help="Number of episodes in process.")
-    ] = defaults.ASSURANCE_EPISODES,
-    seed: console.FirstSeedOption = defaults.EVALUATION_SEED,
+    limits: Annotated[str, Option(autocompletion=console.complete_names("limits"))],
+    model: console.OptionalRobotOption = None,
+    world: console.WorldsOption = None,
+    episodes: console.CountOption = defaults.ASSURANCE_EPISODES,
+    seed: console.SeedOption = defaults.EVALUATION_SEED,
     randomisation: Annotated[
-        str,
-        Option(
-            autocompletion=console.complete_names("randomisation"),
-            help="Drawn for each episode of the policy: a shipped one or a YAML file.",
-        ),
+        str, Option(autocompletion=console.complete_names("randomisation"))
     ] = defaults.ASSURANCE_RANDOMISATION,
-    faults: Annotated[
-        int,
-        Option(
-            min=0, help="Number of faults injected over DDS, in real time; needs ROS 2."
-        ),
-    ] = defaults.ASSURANCE_FAULTS,
-    control: Annotated[
-        Literal["no_gate"] | None,
-        Option(
-            help="Run everything without the gate, as a control that must find failures."
-        ),
-    ] = None,
-    replay: Annotated[
-        int | None,
-        Option(min=0, metavar="SEED", help="Only repeat this episode of a run."),
-    ] = None,
-    out: Annotated[
-        Path, Option(help="Folder for all output; an existing run is continued.")
-    ] = Path("runs/assure"),
+    faults: Annotated[int, Option(min=0)] = defaults.ASSURANCE_FAULTS,
+    control: Literal["no_gate"] | None = None,
+    replay: Annotated[int | None, Option(min=0, metavar="SEED")] = None,
+    out: Path = Path("runs/assure"),
     as_json: console.JsonOption = False,
 ) -> None:
-    """Tries to make a gated policy fail, and writes the evidence."""
+    """Tries to make a gated policy fail, and writes the evidence.
+
+    Args:
+        limits: The gate's limits: shipped ones (differential) or a YAML file.
+        model: A model's folder, or a shipped robot; else the policy's own.
+        world: A shipped world or a YAML file; repeatable; arena, clutter and crowd.
+        episodes: Number of episodes in process.
+        seed: Seed of the first episode.
+        randomisation: Drawn for each episode of the policy: a shipped one or a YAML file.
+        faults: Number of faults injected over DDS, in real time; needs ROS 2.
+        control: Run everything without the gate, as a control that must find failures.
+        replay: Only repeat this episode of a run.
+        out: Folder for all output; an existing run is continued.
+
+    Examples:
+        nics assure differential --limits differential --episodes 300
+        nics assure my.onnx --limits my_limits.yaml --out runs/evidence
+    """
     check_above(out / PAGE)
     with console.show_progress("opening robot and policy"):
         from nics_drl_bridge.commands.episodes import model_name, read_contracts
@@ -103,7 +88,11 @@ def assure(
             control=control or "",
             hashes={},
             claims=protocols.choose_claims(opened.robot),
-            versions=_read_versions(),
+            versions={
+                "nics_drl_bridge": __version__,
+                "python": platform.python_version(),
+                **{module: version(module) for module in COMPUTED_WITH},
+            },
             **_choose_faults(faults),
         )
         order = replace(order, hashes=_compute_hashes(order, opened))
@@ -134,11 +123,6 @@ def _choose_faults(count: int) -> dict[str, Any]:
 
     kinds = tuple(FAULTS)
     return {"faults": count, "fault_kinds": kinds, "fault_controls": CONTROLS}
-
-
-def _read_versions() -> dict[str, str]:
-    versions = {"nics_drl_bridge": __version__, "python": platform.python_version()}
-    return versions | {name: version(name) for name in COMPUTED_WITH}
 
 
 def _compute_hashes(order: "Protocol", model: "SimulatorModel") -> dict[str, str]:
@@ -209,9 +193,17 @@ def _replay(run: "Run", seed: int, out: Path, as_json: bool) -> None:
     order.check_same(runs.read_result(out)["protocol"], str(out))
     trial = order.find_trial(seed)
     if trial in order.list_faults():
-        row = _inject_again(order, trial, out / "logs" / f"replay_{seed}")
-        console.print_line(as_json, _list_values(row), **row)
-        return
+        from nics_drl_bridge.nodes.gate_faults import inject_trials
+
+        logs = out / "logs" / f"replay_{seed}"
+        say = partial(typer.echo, err=True)
+        for row in inject_trials(order, logs, say, [trial]):
+            console.print_line(as_json, _list_values(row), **row)
+            return
+        raise BackendError(
+            f"--replay {seed}: {trial.kind} could not be injected, because the robot did not "
+            "move; try again, or look into the logs."
+        )
     rows, _ = runs.read_rows(out / runs.LOG, list(order.list_trials()))
     row = json.loads(format_json(run.drive(trial)))
     picture = out / f"replay_{seed}.png"
@@ -221,18 +213,6 @@ def _replay(run: "Run", seed: int, out: Path, as_json: bool) -> None:
     comparison = "as in the run" if same else "not in the run, or different there"
     text = f"{_list_values(row)}\nthis episode is {comparison}; its picture: {picture}"
     console.print_line(as_json, text, **row, same=same, picture=str(picture))
-
-
-def _inject_again(order: "Protocol", trial: "Trial", logs: Path) -> dict[str, Any]:
-    from nics_drl_bridge.nodes.gate_faults import inject_trials
-
-    rows = list(inject_trials(order, logs, partial(typer.echo, err=True), [trial]))
-    if not rows:
-        raise BackendError(
-            f"--replay {trial.seed}: {trial.kind} could not be injected, because the robot did "
-            "not move; try again, or look into the logs."
-        )
-    return rows[0]
 
 
 def _list_values(row: Mapping[str, Any]) -> str:

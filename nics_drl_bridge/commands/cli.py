@@ -19,7 +19,7 @@ from nics_drl_bridge.commands.console import (
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.doctor import doctor, explain
 from nics_drl_bridge.commands.evaluate import evaluate
-from nics_drl_bridge.commands.examples import complete
+from nics_drl_bridge.commands.help import complete
 from nics_drl_bridge.commands.install import install
 from nics_drl_bridge.commands.interrupts import was_interrupted
 from nics_drl_bridge.commands.listing import list_

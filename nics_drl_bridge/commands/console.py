@@ -8,17 +8,16 @@ from functools import wraps
 from glob import glob
 from inspect import signature
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge import defaults, extensions
+from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.interrupts import was_interrupted
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from nics_drl_bridge.files import format_json
-from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.status import STATUS
 
 WIDEST = 10_000
@@ -58,58 +57,25 @@ POLICIES = complete_names(
     "policies", also=("dynamic_window", "mppi", "random", "straight")
 )
 ROBOT_OPTIONS = ("--robot", "--model")  # synonyms in every command
+ROBOT = Option(*ROBOT_OPTIONS, autocompletion=ROBOTS)
+WORLD = Option("--world", "--scene", autocompletion=WORLDS)
 
-
-def make_robot_option(help: str) -> Any:
-    """Returns the option that names a robot or a model."""
-    return Option(*ROBOT_OPTIONS, autocompletion=ROBOTS, help=help)
-
-
-def make_world_option(help: str) -> Any:
-    """Returns the option that names a world, or several."""
-    return Option("--world", "--scene", autocompletion=WORLDS, help=help)
-
-
-RobotOption = Annotated[
-    str, make_robot_option("A shipped robot (see nics list robots) or a YAML file.")
-]
-DrivenRobotOption = Annotated[
-    str | None,
-    make_robot_option(
-        f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}."
-    ),
-]
-PolicyModelOption = Annotated[
-    str | None,
-    make_robot_option("A model's folder, or a shipped robot; else the policy's own."),
-]
-LidarOption = Annotated[
-    str | None,
-    Option(
-        autocompletion=complete_names("lidars"),
-        help="A shipped lidar or a YAML file; else the robot's own, or paper.",
-    ),
-]
-WorldOption = Annotated[
-    str, make_world_option(f"A shipped world ({defaults.WORLD}) or a YAML file.")
-]
+# Options of several commands. Those without help mean something else in each command, whose
+# docstring says it.
+RobotOption = Annotated[str, ROBOT]
+OptionalRobotOption = Annotated[str | None, ROBOT]
+WorldsOption = Annotated[list[str] | None, WORLD]
+LidarOption = Annotated[str | None, Option(autocompletion=complete_names("lidars"))]
+CountOption = Annotated[int, Option(min=1)]
+OptionalCountOption = Annotated[int | None, Option(min=1)]
+SeedOption = Annotated[int, Option(min=0)]
+JsonOption = Annotated[bool, Option("--json", help="Print one JSON object instead.")]
+YesOption = Annotated[bool, Option("--yes")]
+SimTimeOption = Annotated[bool, Option("--use-sim-time", help="Take time from /clock.")]
 PolicyFileArgument = Annotated[
     str,
     Argument(
         autocompletion=POLICIES, help="A policy file, or the name of a shipped one."
-    ),
-]
-FirstSeedOption = Annotated[int, Option(min=0, help="Seed of the first episode.")]
-SeedOption = Annotated[int, Option(min=0, help="Seed of the episode.")]
-JsonOption = Annotated[bool, Option("--json", help="Print one JSON object instead.")]
-TopicsOption = Annotated[
-    Path | None, Option(help="YAML file: a bag's topic for each role.")
-]
-OtherLidarOption = Annotated[
-    str | None,
-    Option(
-        autocompletion=complete_names("lidars"),
-        help="A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.",
     ),
 ]
 RandomisationOption = Annotated[
@@ -213,9 +179,14 @@ def check_options(command: Callable[..., Any]) -> Callable[..., Any]:
                     alternatives = " or ".join(map(_format_option, needed_names))
                     fix = f"{alternatives}; add it, or remove this option."
                     raise ConfigError(f"{_format_option(name)}: requires {fix}")
-                for conflicting in conflicting_options.get(name, ()):
-                    if conflicting in given_options:
-                        _refuse_both(_format_option(conflicting), _format_option(name))
+                for other in conflicting_options.get(name, ()):
+                    if other in given_options:
+                        refused = _format_option(other)
+                        partner = _format_option(name)
+                        fix = f"remove {refused} or {partner}."
+                        raise ConfigError(
+                            f"{refused} can't be combined with {partner}; {fix}"
+                        )
             return command(**options)
 
     return run
@@ -227,11 +198,6 @@ def _check_finite(name: str, value: Any) -> None:
             raise ConfigError(
                 f"{_format_option(name)} {item}: must be a finite number."
             )
-
-
-def _refuse_both(refused: str, partner: str) -> NoReturn:
-    fix = f"remove {refused} or {partner}."
-    raise ConfigError(f"{refused} can't be combined with {partner}; {fix}")
 
 
 def _format_option(name: str) -> str:

@@ -12,30 +12,30 @@ from nics_drl_bridge.commands import console
 
 
 def demo(
-    recording: Annotated[
-        Path | None, Option(help="A drive; by default a textbook one.")
-    ] = None,
-    out: Annotated[Path, Option(help="Folder for everything the demo writes.")] = Path(
-        "runs/demo"
-    ),
-    robot: console.DrivenRobotOption = None,
-    world: console.WorldOption = defaults.WORLD,
-    episodes: Annotated[
-        int, Option(min=1, help="Episodes in process, and again over DDS.")
-    ] = defaults.DEMO_EPISODES,
-    policy: Annotated[
-        str | None,
-        Option(
-            autocompletion=console.POLICIES,
-            help="Skip training: use a policy file, a shipped one or a baseline.",
-        ),
-    ] = None,
-    train_steps: Annotated[
-        int | None, Option(min=1, help="Environment steps to train.")
-    ] = None,
+    recording: Path | None = None,
+    out: Path = Path("runs/demo"),
+    robot: console.OptionalRobotOption = None,
+    world: Annotated[str, console.WORLD] = defaults.WORLD,
+    episodes: console.CountOption = defaults.DEMO_EPISODES,
+    policy: Annotated[str | None, Option(autocompletion=console.POLICIES)] = None,
+    train_steps: console.OptionalCountOption = None,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Runs the whole chain once, from a recording to a report."""
+    """Runs the whole chain once, from a recording to a report.
+
+    Args:
+        recording: A drive; by default a textbook one.
+        out: Folder for everything the demo writes.
+        robot: Shipped, or a YAML file; else the recording's own, or differential.
+        world: A shipped world or a YAML file.
+        episodes: Episodes in process, and again over DDS.
+        policy: Skip training: use a policy file, a shipped one or a baseline.
+        train_steps: Environment steps to train.
+
+    Examples:
+        nics demo
+        nics demo --recording drive.npz --robot my_robot.yaml
+    """
     from nics_drl_bridge.commands.demo_report import DemoPlan
     from nics_drl_bridge.commands.demo_run import Demo
 

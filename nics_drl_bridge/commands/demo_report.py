@@ -110,8 +110,15 @@ def make_verdict(results: DemoResults) -> Sequence[str]:
             f"of {summary.episodes} unseen episodes succeed in the fast simulator ({between})",
             success.value >= GOOD,
         ),
-        *_make_node_tiles(results),
     ]
+    if results.live is not None:
+        count = len(results.there)
+        reached = successes(results.there)
+        told = f"in process, {successes(results.here)} of the same {count}"
+        told = f"episodes succeed over DDS; {told}"
+        tiles.append((f"{reached} of {count}", told, reached >= GOOD * count))
+        end = "arrived" if results.arrived else "did not arrive"
+        tiles.append((end, "deployed, in real time", results.arrived))
     conclusion = conclude(results.identified)
     if conclusion.ready:
         next_step = "train longer, with --train-steps"
@@ -127,24 +134,6 @@ def make_verdict(results: DemoResults) -> Sequence[str]:
         f"nics evaluate {driven}",
         "nics demo --recording DRIVE --robot ROBOT.yaml  # your own robot",
     )
-
-
-def _make_node_tiles(results: DemoResults) -> list[tuple[str, str, bool]]:
-    """Returns the tiles of the episodes over DDS and of the deployment, if there were any."""
-    if results.live is None:
-        return []
-    count = len(results.there)
-    reached = successes(results.there)
-    here = f"in process, {successes(results.here)} of the same {count}"
-    end = "arrived" if results.arrived else "did not arrive"
-    return [
-        (
-            f"{reached} of {count}",
-            f"episodes succeed over DDS; {here}",
-            reached >= GOOD * count,
-        ),
-        (end, "deployed, in real time", results.arrived),
-    ]
 
 
 def _make_policy_lines(results: DemoResults) -> list[str]:
@@ -205,7 +194,13 @@ def format_episodes(results: DemoResults) -> list[str]:
         f"its goal, that of seed {live.seed}."
     )
     about = "Deviation is the greatest distance between the two true paths at the same step."
-    table = _make_episode_table(here, there)
+    rows = [
+        (f"{a.seed}", *_describe(a), *_describe(b), f"{deviation(a, b):.1g}")
+        for a, b in zip(here, there, strict=True)
+    ]
+    columns = ("steps", "path [m]")
+    heads = ("seed", LABELS[FAST], *columns, LABELS[DDS], *columns, "deviation [m]")
+    table = html.make_table(heads, rows)
     return [
         html.make_paragraph(text),
         html.make_picture(results.draw_trajectories(shown), ""),
@@ -213,14 +208,5 @@ def format_episodes(results: DemoResults) -> list[str]:
     ]
 
 
-def _make_episode_table(here: Sequence[Episode], there: Sequence[Episode]) -> str:
-    def describe(episode: Episode) -> tuple[str, ...]:
-        return episode.result, f"{episode.steps}", f"{episode.length:.2f}"
-
-    rows = [
-        (f"{a.seed}", *describe(a), *describe(b), f"{deviation(a, b):.1g}")
-        for a, b in zip(here, there, strict=True)
-    ]
-    columns = ("steps", "path [m]")
-    heads = ("seed", LABELS[FAST], *columns, LABELS[DDS], *columns, "deviation [m]")
-    return html.make_table(heads, rows)
+def _describe(episode: Episode) -> tuple[str, ...]:
+    return episode.result, f"{episode.steps}", f"{episode.length:.2f}"

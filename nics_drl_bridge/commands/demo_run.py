@@ -45,7 +45,7 @@ from nics_drl_bridge.policy.train.settings import (
 )
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import open_drive, read_recording
-from nics_drl_bridge.recording.recording import Recording, save_recording
+from nics_drl_bridge.recording.recording import save_recording
 from nics_drl_bridge.report import html, pictures
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
@@ -91,7 +91,10 @@ class Demo:
         results = DemoResults(
             plan, model, identified, learned, summaries, here, [], None
         )
-        self._draw_paths(results)
+        # The report takes a while.
+        paths = plan.out / "paths.png"
+        write_bytes(paths, results.draw_trajectories({LABELS[FAST]: here}))
+        self._say(f"  the paths are drawn in {paths}")
         over = ""
         if topics:
             results = self._drive_nodes(results)
@@ -101,12 +104,6 @@ class Demo:
         return (
             f"demo: in process {successes(here)}/{plan.episodes}, {over}report {file}"
         )
-
-    def _draw_paths(self, results: DemoResults) -> None:
-        """Draws the paths in process, because the report takes a while."""
-        paths = self._plan.out / "paths.png"
-        write_bytes(paths, results.draw_trajectories({LABELS[FAST]: results.here}))
-        self._say(f"  the paths are drawn in {paths}")
 
     def _drive_nodes(self, results: DemoResults) -> DemoResults:
         """Returns the results with the same episodes over DDS, and one by the deployed nodes."""
@@ -138,21 +135,18 @@ class Demo:
         )
         write_text(file, html.make_page("nics_drl_bridge: demo", lead, sections))
 
-    def _record_or_read(self) -> tuple[RobotSpec, Recording]:
-        """Reads the plan's drive and its robot, or records a drive of a textbook robot."""
-        plan = self._plan
-        if plan.recording is not None:
-            return open_drive(plan.recording, plan.robot)
-        robot = load_robot(plan.robot or DEFAULT_ROBOT)
-        file = plan.out / "recording.npz"
-        self._say(f"recording a drive of the textbook {robot.name!r} robot")
-        rng = np.random.default_rng(RECORDING_SEED)
-        save_recording(textbook.record(robot, rng), file)
-        return robot, read_recording(file, robot)
-
     def _generate(self) -> tuple[SimulatorModel, Identified]:
-        world = load_world(self._plan.world)
-        robot, recording = self._record_or_read()
+        plan = self._plan
+        world = load_world(plan.world)
+        if plan.recording is not None:
+            robot, recording = open_drive(plan.recording, plan.robot)
+        else:
+            robot = load_robot(plan.robot or DEFAULT_ROBOT)
+            file = plan.out / "recording.npz"
+            self._say(f"recording a drive of the textbook {robot.name!r} robot")
+            rng = np.random.default_rng(RECORDING_SEED)
+            save_recording(textbook.record(robot, rng), file)
+            recording = read_recording(file, robot)
         source = recording.source
         self._say(f"generating a simulator of the robot {robot.name!r} from {source}")
         # The demo must steer even if the drive did not show it; the report lists the
@@ -160,7 +154,7 @@ class Demo:
         model, identified = generate(
             recording, robot, mount_lidar(robot), world.shapes, assume=True
         )
-        save_model(model, self._plan.model)
+        save_model(model, plan.model)
         self._say(format_opening(source, identified))
         return model, identified
 

@@ -21,36 +21,31 @@ LOAD_NOTE = (
 
 
 def doctor(
-    bag: Annotated[
-        Path | None, Argument(help="A bag to check; by default the live robot.")
-    ] = None,
-    model: Annotated[
-        str | None,
-        console.make_robot_option(
-            f"Check against a model's folder, or a shipped robot ({DEFAULT_ROBOT})."
-        ),
-    ] = None,
-    policy: Annotated[
-        str | None, Option(help="Check against a policy file instead.")
-    ] = None,
+    bag: Annotated[Path | None, Argument()] = None,
+    model: console.OptionalRobotOption = None,
+    policy: str | None = None,
     namespace: console.NamespaceOption = "",
-    duration: Annotated[
-        float, Option(min=1.0, help="Time to listen to a robot [s].")
-    ] = defaults.LISTEN_S,
+    duration: Annotated[float, Option(min=1.0)] = defaults.LISTEN_S,
     imu: console.ImuOption = defaults.IMU_TOPIC,
-    install: Annotated[
-        bool,
-        Option(
-            "--install", help="Check this machine instead: which features work here."
-        ),
-    ] = False,
-    load: Annotated[
-        bool,
-        Option("--load", help="Measure a vehicle's nodes on this machine instead."),
-    ] = False,
+    install: Annotated[bool, Option("--install")] = False,
+    load: Annotated[bool, Option("--load")] = False,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Checks a robot or a bag against a model; sends nothing to it."""
+    """Checks a robot or a bag against a model; sends nothing to it.
+
+    Args:
+        bag: A bag to check; by default the live robot.
+        model: Check against a model's folder, or a shipped robot (differential).
+        policy: Check against a policy file instead.
+        duration: Time to listen to a robot [s].
+        install: Check this machine instead: which features work here.
+        load: Measure a vehicle's nodes on this machine instead.
+
+    Examples:
+        nics doctor --install
+        nics doctor drive_bag --model my_robot
+        nics doctor --policy policy.onnx --namespace robot1
+    """
     if install:
         _tell_installation(as_json)
         return
@@ -154,10 +149,17 @@ def _format_sum(parts: Sequence[float]) -> str:
 
 
 def explain(
-    file: Annotated[Path, Argument(help="Black box written at a stop, *.jsonl.")],
+    file: Path,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Explains why command_gate stopped a robot, from its black box."""
+    """Explains why command_gate stopped a robot, from its black box.
+
+    Args:
+        file: Black box written at a stop, *.jsonl.
+
+    Examples:
+        nics explain ~/.ros/black_box/stop.jsonl
+    """
     from nics_drl_bridge.gate import black_box
 
     replay = black_box.replay(file)

@@ -344,7 +344,7 @@ def limit_time(
 
 def select_places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]:
     """Returns the places of an order, or the usual ones that work; reports why others don't."""
-    places = list[str]()
+    places: list[str] = []
     for place in order.places or BY_DEFAULT:
         try:
             check_place(place, robot)
@@ -379,17 +379,14 @@ ENDS = r"\.(onnx|ya?ml)$"  # suffixes of a policy or a mapping
 
 def shorten_name(policy: str, among: Sequence[str]) -> str:
     """Returns the stem of a policy's path, with parent folders if another has the same stem."""
-    parts = _split_path(policy)
-    others = [_split_path(other) for other in among if other != policy]
-    for count in range(1, len(parts)):
-        if all(other[-count:] != parts[-count:] for other in others):
-            return "_".join(parts[-count:])
-    return parts[-1]
-
-
-def _split_path(policy: str) -> list[str]:
-    path = Path(re.sub(ENDS, "", policy)).absolute()
-    return [part.strip("/") for part in path.parts]
+    path, *others = (
+        Path(re.sub(ENDS, "", each)).absolute().parts
+        for each in (policy, *(other for other in among if other != policy))
+    )
+    for count in range(1, len(path)):
+        if all(other[-count:] != path[-count:] for other in others):
+            return "_".join(path[-count:])
+    return path[-1]
 
 
 def model_name(model: str | None, contracts: Mapping[str, Contract]) -> str:
@@ -414,13 +411,16 @@ def write_evaluation(
     order: EvaluationOrder, name: str, model: SimulatorModel, evaluated: list[Evaluated]
 ) -> None:
     """Writes the `evaluation.json` of an order, driven with a model called `name`."""
-    policies: dict[str, dict[str, Any]] = {}
-    for result in evaluated:
-        places = policies[result.policy] = {}
-        for place, drives in result.runs.items():
-            figures = result.tallies[place].figures()
-            episodes = [episode.plain() for episode in drives]
-            places[place] = {**figures, "each": episodes}
+    policies = {
+        result.policy: {
+            place: {
+                **result.tallies[place].figures(),
+                "each": [episode.plain() for episode in episodes],
+            }
+            for place, episodes in result.runs.items()
+        }
+        for result in evaluated
+    }
     data = {
         "model": name,
         "model_fingerprint": model.fingerprint,
@@ -435,26 +435,24 @@ def write_evaluation(
 
 def format_rows(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
     """Returns the rows of the table with the columns `HEADS`, as text."""
-    rows = list[tuple[str, ...]]()
-    for result in evaluated:
-        for place, tally in result.tallies.items():
-            success = tally.success
-            row = (
-                result.policy,
-                LABELS[place],
-                _format_percent(success.value),
-                f"{100 * success.low:.0f} to {100 * success.high:.0f} %",
-                _format_percent(tally.believed.value),
-                _format_percent(tally.collision.value),
-                _format_percent(tally.time_out.value),
-                _format_mean(tally.length.value),
-                _format_mean(tally.time.value),
-                _format_percent(tally.same),
-                f"{tally.deviation.value:.2g}",
-                f"{tally.greatest_deviation:.2g}",
-            )
-            rows.append(row)
-    return rows
+    return [
+        (
+            result.policy,
+            LABELS[place],
+            _format_percent(tally.success.value),
+            f"{100 * tally.success.low:.0f} to {100 * tally.success.high:.0f} %",
+            _format_percent(tally.believed.value),
+            _format_percent(tally.collision.value),
+            _format_percent(tally.time_out.value),
+            _format_mean(tally.length.value),
+            _format_mean(tally.time.value),
+            _format_percent(tally.same),
+            f"{tally.deviation.value:.2g}",
+            f"{tally.greatest_deviation:.2g}",
+        )
+        for result in evaluated
+        for place, tally in result.tallies.items()
+    ]
 
 
 def _format_percent(fraction: float) -> str:
@@ -468,12 +466,11 @@ def _format_mean(value: float) -> str:
 
 def summarize(result: Evaluated) -> str:
     """Summarises a policy in one line."""
-    rates = []
-    for place, tally in result.tallies.items():
-        believed = ", as believed," if place == VEHICLE else ""
-        rates.append(
-            f"{LABELS[place]}{believed} {_format_percent(tally.success.value)}"
-        )
+    labels = LABELS | {VEHICLE: f"{LABELS[VEHICLE]}, as believed,"}
+    rates = [
+        f"{labels[place]} {_format_percent(tally.success.value)}"
+        for place, tally in result.tallies.items()
+    ]
     return f"{result.policy}: success {', '.join(rates)}"
 
 
@@ -512,127 +509,111 @@ def _drive_again(
     return simulated
 
 
-def drive_vehicle(
-    order: EvaluationOrder,
-    goals: GoalOrder,
-    say: Say,
-    ask: Say,
-    confirm: Say | None = None,
-    arm: bool = False,
-    **options: Any,
-) -> Evaluated:
+@dataclass(frozen=True)
+class VehicleDrive:
     """Drives episodes on the vehicle and in the fast simulator, and compares them.
 
     Commands go to `cmd_vel_raw`, and so through an armed gate. The fast simulator starts at the
-    vehicle's actual starting poses. `ask` gets each start and returns when the episode may begin.
-    `confirm` gets each goal beyond a distance limit and returns if the vehicle may drive there;
-    without `confirm`, such a goal is refused. Raises BackendError if the vehicle does not answer or
-    does not fit its model, ConfigError if a goal is refused.
+    vehicle's actual starting poses.
     """
-    return _VehicleDrive(order, goals, say, ask, confirm, arm).run(options)
 
+    order: EvaluationOrder
+    goals: GoalOrder
+    say: Say
+    ask: Say  # gets each start, and returns when the episode may begin
+    # gets each goal beyond a distance limit, and returns if the vehicle may drive there; None: such
+    # a goal is refused
+    confirm: Say | None = None
+    arm: bool = False  # arm the gate before each episode
 
-class _VehicleDrive:
-    """Drives the episodes of an order on the vehicle; see `drive_vehicle`."""
-
-    def __init__(
-        self,
-        order: EvaluationOrder,
-        goals: GoalOrder,
-        say: Say,
-        ask: Say,
-        confirm: Say | None,
-        arm: bool,
-    ) -> None:
-        self._order = order
-        self._goals = goals
-        self._say = say
-        self._ask = ask
-        self._confirm = confirm
-        self._arm = arm
-        self._policy = order.policies[0]
-        contracts = read_contracts(order.policies, order.model)
-        self._name = model_name(order.model, contracts)
-        self._model = open_model(self._name)
-        self._world = load_worlds(order.world)
-        self._scenes = self._draw_scenes()
-        self._conditions = limit_time(
-            order.conditions, contracts, self._model, self._world, say
-        )
-
-    def _draw_scenes(self) -> list[Scene]:
+    def _draw_scenes(self, model: SimulatorModel, world: AnyWorld) -> list[Scene]:
         """Draws the episodes; refuses far goals before the operator has to wait."""
-        radius = self._model.robot.footprint_radius
-        scenes = [sample_scene(self._world, radius, seed) for seed in self._order.seeds]
-        if not self._goals.needs_pose:
-            planned = map(self._goals.episode, scenes)
+        radius = model.robot.footprint_radius
+        scenes = [sample_scene(world, radius, seed) for seed in self.order.seeds]
+        if not self.goals.needs_pose:
+            planned = map(self.goals.episode, scenes)
             farthest = max(planned, key=lambda episode: episode.distance)
-            farthest.confirm(self._confirm)
+            farthest.confirm(self.confirm)
         return scenes
 
-    def run(self, options: dict[str, Any]) -> Evaluated:
-        """Drives everything, and writes the results; `options` are those of the backend."""
-        order = self._order
-        model = self._model
+    def run(self, **options: Any) -> Evaluated:
+        """Drives everything, and writes the results; `options` are those of the backend.
+
+        Raises BackendError if the vehicle does not answer or does not fit its model, ConfigError if
+        a goal is refused.
+        """
+        order = self.order
+        policy = order.policies[0]
+        contracts = read_contracts(order.policies, order.model)
+        name = model_name(order.model, contracts)
+        model = open_model(name)
+        world = load_worlds(order.world)
+        scenes = self._draw_scenes(model, world)
+        conditions = limit_time(order.conditions, contracts, model, world, self.say)
         # A policy that does not fit must be refused before anything moves.
-        open_policy(self._policy, model, self._conditions.kind)
+        open_policy(policy, model, conditions.kind)
         imu = options.get("imu", defaults.IMU_TOPIC)
-        _examine_vehicle(model, options.get("namespace", ""), imu, self._say)
-        runs = {VEHICLE: self._drive(options)}
+        _examine_vehicle(model, options.get("namespace", ""), imu, self.say)
+        driven = self._drive(model, world, scenes, conditions, options)
+        runs = {VEHICLE: driven}
         try:
-            runs[FAST] = _drive_again(
-                runs[VEHICLE], self._policy, model, order.world, self._conditions
-            )
+            runs[FAST] = _drive_again(driven, policy, model, order.world, conditions)
         except ConfigError as error:  # the start may be inside a wall of the map
-            self._say(f"  not driven again in process: {error}")
-        result = judge_runs(self._policy, runs, model, self._world, order.out)
-        driven = replace(order, conditions=self._conditions)
-        write_evaluation(driven, self._name, model, [result])
+            self.say(f"  not driven again in process: {error}")
+        result = judge_runs(policy, runs, model, world, order.out)
+        write_evaluation(replace(order, conditions=conditions), name, model, [result])
         return result
 
-    def _drive(self, options: dict[str, Any]) -> list[Episode]:
+    def _drive(
+        self,
+        model: SimulatorModel,
+        world: AnyWorld,
+        scenes: Sequence[Scene],
+        conditions: Conditions,
+        options: dict[str, Any],
+    ) -> list[Episode]:
         """Drives the vehicle; only its own estimate of its path is known."""
-        goals = self._goals
-        ground = goals.ground(self._world)
+        goals = self.goals
+        ground = goals.ground(world)
         fixed = {"mode": "realtime", "vehicle": True, "command_topic": RAW}
-        fixed |= {"say": self._say, "start": goals.start, "lays_map": goals.lays_map}
-        backend = make_backend("dds", self._model, ground, **fixed, **options)
+        fixed |= {"say": self.say, "start": goals.start, "lays_map": goals.lays_map}
+        backend = make_backend("dds", model, ground, **fixed, **options)
         env, driver = make_env(
-            backend, self._policy, self._model, ground, self._conditions
+            backend, self.order.policies[0], model, ground, conditions
         )
-        begin = partial(_arm, self._arm, options.get("namespace", ""), self._say)
+        begin = partial(_arm, self.arm, options.get("namespace", ""), self.say)
         episodes = list[Episode]()
         with closing(env):
-            for seed, scene in zip(self._order.seeds, self._scenes, strict=True):
+            for seed, scene in zip(self.order.seeds, scenes, strict=True):
                 episode = self._agree_on_episode(
                     scene, backend.present_pose, len(episodes) + 1
                 )
                 driven = drive(env, driver, seed, episode.options, begin)
                 episodes.append(replace(driven, path=driven.estimate))
-                self._say(f"  {report_end(episodes[-1])}")
+                self.say(f"  {report_end(episodes[-1])}")
         return episodes
 
     def _agree_on_episode(
         self, scene: Scene, find_pose: Callable[[], Array], number: int
     ) -> VehicleEpisode:
         """Asks for the start of an episode, and for confirmation of a far goal; returns it."""
-        goals = self._goals
+        goals = self.goals
 
         def ask(asked: VehicleEpisode) -> None:
-            last = "" if self._arm else f"; arm {GATE}"
-            which = f"episode {number} of {self._order.episodes}"
-            self._ask(f"{which}: {asked.sentence()}{last}")
+            last = "" if self.arm else f"; arm {GATE}"
+            which = f"episode {number} of {self.order.episodes}"
+            self.ask(f"{which}: {asked.sentence()}{last}")
 
         if not goals.needs_pose:
             episode = goals.episode(scene)
             ask(episode)
             return episode
         asked = goals.episode(scene, find_pose())
-        asked.confirm(self._confirm)
+        asked.confirm(self.confirm)
         ask(asked)
         episode = goals.episode(scene, find_pose())
         if episode.distance > asked.distance + NEAR_M:  # it was moved in the meantime
-            episode.confirm(self._confirm)
+            episode.confirm(self.confirm)
         return episode
 
 

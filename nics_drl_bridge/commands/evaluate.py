@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 from typer import Argument, Option
@@ -10,38 +10,17 @@ from typer import Argument, Option
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
-
-if TYPE_CHECKING:
-    from nics_drl_bridge.policy.shadow import Shadow
 from nics_drl_bridge.files import check_above, format_json, write_bytes, write_text
 
 
 def evaluate(
     policies: Annotated[
-        list[str],
-        Argument(
-            metavar="POLICY...",
-            help="Policy files, shipped policies (differential), or baselines "
-            "(dynamic_window, mppi, straight, random).",
-            autocompletion=console.POLICIES,
-        ),
+        list[str], Argument(metavar="POLICY...", autocompletion=console.POLICIES)
     ],
-    model: console.PolicyModelOption = None,
+    model: console.OptionalRobotOption = None,
     task: console.TaskOption = None,
-    world: Annotated[
-        str,
-        console.make_world_option(
-            f"A shipped world ({defaults.EVALUATION_WORLD}) or a YAML file."
-        ),
-    ] = defaults.EVALUATION_WORLD,
-    places: Annotated[
-        list[str] | None,
-        Option(
-            "--in",
-            help="fast, dds, mujoco_dds or dart_dds; repeatable; "
-            "by default those of the first three that work here.",
-        ),
-    ] = None,
+    world: Annotated[str, console.WORLD] = defaults.EVALUATION_WORLD,
+    places: Annotated[list[str] | None, Option("--in")] = None,
     episodes: Annotated[
         int | None,
         Option(
@@ -49,70 +28,60 @@ def evaluate(
             help=f"Number of episodes; {defaults.EVALUATION_EPISODES}, or 1 on a vehicle.",
         ),
     ] = None,
-    seed: console.FirstSeedOption = defaults.EVALUATION_SEED,
-    lidar: console.OtherLidarOption = None,
+    seed: console.SeedOption = defaults.EVALUATION_SEED,
+    lidar: console.LidarOption = None,
     randomisation: console.RandomisationOption = None,
     gate: console.GateOption = None,
-    out: Annotated[Path, Option(help="Folder for all output.")] = Path("runs/evaluate"),
-    shadow: Annotated[
-        Path | None, Option(help="Compare policies with the drive in a bag.")
-    ] = None,
+    out: Path = Path("runs/evaluate"),
+    shadow: Path | None = None,
     topic: console.RolesOption = None,
-    ahead: Annotated[
-        float,
-        Option(
-            help="For --shadow without --goal: use the robot's position this much later [s]."
-        ),
-    ] = defaults.SHADOW_AHEAD_S,
-    backend: Annotated[
-        str | None, Option(help="dds, which --hardware implies.", metavar="dds")
-    ] = None,
-    hardware: Annotated[
-        bool, Option("--hardware", help="Drive the vehicle, through command_gate.")
-    ] = False,
-    start: Annotated[
-        Literal["wait", "present"],
-        Option(
-            help="For --hardware: wait until it is placed at the start, or start where it is."
-        ),
-    ] = defaults.VEHICLE_START,
-    goal: Annotated[
-        str | None,
-        Option(
-            metavar="X,Y",
-            help="Goal [m], see --goal-frame; else the world's. For --shadow: in map.",
-        ),
-    ] = None,
+    ahead: float = defaults.SHADOW_AHEAD_S,
+    backend: Annotated[str | None, Option(metavar="dds")] = None,
+    hardware: Annotated[bool, Option("--hardware")] = False,
+    start: Literal["wait", "present"] = defaults.VEHICLE_START,
+    goal: Annotated[str | None, Option(metavar="X,Y")] = None,
     goal_frame: Annotated[
-        Literal["robot", "map"] | None,
-        Option(
-            metavar="robot|map",
-            help="For --hardware: the goal is relative to the robot's start (ahead, "
-            "left), or in map; robot with --start present, else map.",
-        ),
+        Literal["robot", "map"] | None, Option(metavar="robot|map")
     ] = None,
     confirm_beyond: Annotated[
-        float,
-        Option(
-            min=0.0,
-            metavar="METRES",
-            help="For --hardware: ask for confirmation of goals farther away [m].",
-        ),
+        float, Option(min=0.0, metavar="METRES")
     ] = defaults.CONFIRMED_BEYOND_M,
     namespace: console.NamespaceOption = "",
-    pose_type: Annotated[
-        str, Option(help="For --hardware: type of `pose`, in map.")
-    ] = defaults.POSE_TYPE,
+    pose_type: str = defaults.POSE_TYPE,
     imu: console.ImuOption = defaults.IMU_TOPIC,
-    yes: Annotated[
-        bool, Option("--yes", help="For --hardware: ask no questions.")
-    ] = False,
-    arm: Annotated[
-        bool, Option("--arm", help="For --hardware: arm command_gate.")
-    ] = False,
+    yes: console.YesOption = False,
+    arm: Annotated[bool, Option("--arm")] = False,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Drives policies through the same episodes, and compares them."""
+    """Drives policies through the same episodes, and compares them.
+
+    Args:
+        policies: Policy files, shipped policies (differential), or baselines (dynamic_window, mppi,
+            straight, random).
+        model: A model's folder, or a shipped robot; else the policy's own.
+        world: A shipped world or a YAML file.
+        places: fast, dds, mujoco_dds or dart_dds; repeatable; by default those of the first three
+            that work here.
+        seed: Seed of the first episode.
+        lidar: A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.
+        out: Folder for all output.
+        shadow: Compare policies with the drive in a bag.
+        ahead: For --shadow without --goal: use the robot's position this much later [s].
+        backend: dds, which --hardware implies.
+        hardware: Drive the vehicle, through command_gate.
+        start: For --hardware: wait until it is placed at the start, or start where it is.
+        goal: Goal [m], see --goal-frame; else the world's. For --shadow: in map.
+        goal_frame: For --hardware: the goal is relative to the robot's start (ahead, left), or in
+            map; robot with --start present, else map.
+        confirm_beyond: For --hardware: ask for confirmation of goals farther away [m].
+        pose_type: For --hardware: type of `pose`, in map.
+        yes: For --hardware: ask no questions.
+        arm: For --hardware: arm command_gate.
+
+    Examples:
+        nics evaluate differential dynamic_window --world circles --in fast
+        nics evaluate runs/mine/seed_0/policy.onnx --world doorway --episodes 100
+    """
     place = _parse_point(goal)
     if backend not in (None, "dds"):
         raise ConfigError(
@@ -153,18 +122,11 @@ def evaluate(
             place, goal_frame, start, pose_type != defaults.POSE_TYPE, confirm_beyond
         )
         with extensions.require_modules("nics evaluate --hardware"):
-            driven = driving.drive_vehicle(
-                order,
-                goals,
-                tell,
-                partial(_ask, yes),
-                partial(_confirm, yes),
-                arm,
-                namespace=namespace,
-                pose_type=pose_type,
-                imu=imu,
-            )
-        evaluated = [driven]
+            ask = partial(_ask, yes)
+            confirm = partial(_confirm, yes)
+            drive = driving.VehicleDrive(order, goals, tell, ask, confirm, arm)
+            options = {"namespace": namespace, "pose_type": pose_type, "imu": imu}
+            evaluated = [drive.run(**options)]
     else:
         with console.show_progress("opening robot and policies") as advance:
             evaluated = driving.evaluate(order, tell, advance)
@@ -204,7 +166,7 @@ def _parse_point(text: str | None) -> tuple[float, float] | None:
     raise ConfigError(f"--goal {text!r}: must be X,Y in metres, such as 2.5,-1.")
 
 
-def _list_differences(policy: str, comparison: "Shadow") -> list[tuple[str, ...]]:
+def _list_differences(policy: str, comparison: Any) -> list[tuple[str, ...]]:
     """Returns a row for each command: its differences, and how often its sign is opposite."""
     rows = []
     commands = comparison.differences().items()
@@ -213,17 +175,6 @@ def _list_differences(policy: str, comparison: "Shadow") -> list[tuple[str, ...]
         cells = (f"{value:.3g}" for value in amounts)
         rows.append((policy, command, unit, *cells, f"{100 * opposite:.1f} %"))
     return rows
-
-
-def _describe_comparison(comparison: "Shadow") -> str:
-    """Returns where a policy was compared, and where not."""
-    left_out = ", ".join(
-        f"{count} {why}" for why, count in comparison.skipped.items() if count
-    )
-    line = f"compared at {len(comparison.time)} times; left out: {left_out or 'none'}"
-    if comparison.resets:
-        line += f"; its state was reset after {comparison.resets} gaps"
-    return line
 
 
 def _replay_shadow(
@@ -269,7 +220,14 @@ def _replay_shadow(
         write_text(place.with_suffix(".json"), format_json(data) + "\n")
         facts.append(data)
         rows += _list_differences(policy, comparison)
-        lines.append(f"{policy}: {_describe_comparison(comparison)}")
+        left_out = ", ".join(
+            f"{count} {why}" for why, count in comparison.skipped.items() if count
+        )
+        line = f"{policy}: compared at {len(comparison.time)} times"
+        line += f"; left out: {left_out or 'none'}"
+        if comparison.resets:
+            line += f"; its state was reset after {comparison.resets} gaps"
+        lines.append(line)
     heads = (
         "policy",
         "command",

@@ -6,10 +6,10 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from typer import Argument, Option
+from typer import Argument
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import JsonOption, print_line
@@ -20,34 +20,30 @@ if TYPE_CHECKING:
     from nics_drl_bridge.commands.message_build import Source
 
 
-def _refuse_without_wheels(name: str) -> NoReturn:
-    distribution = os.environ.get("ROS_DISTRO", "DISTRO")
-    debian = f"ros-{distribution}-{name.replace('_', '-')}"
-    fix = f"install {name} with your distribution, as by `sudo apt install {debian}`"
-    raise ConfigError(f"nics install: the ROS 2 here does not come from wheels; {fix}.")
-
-
 def install(
     packages: Annotated[
         list[str],
         Argument(
             metavar="PACKAGE...",
-            help="tf2_msgs, ackermann_msgs, or the folder of another package with its msg, srv and "
-            "action.",
             autocompletion=lambda incomplete: [
                 name for name in list_shipped_packages() if name.startswith(incomplete)
             ],
         ),
     ],
-    prefix: Annotated[
-        Path | None,
-        Option(
-            help="Folder to install into, with a setup.bash to source; by default this environment."
-        ),
-    ] = None,
+    prefix: Path | None = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Builds message packages that are missing from ROS 2's wheels."""
+    """Builds message packages that are missing from ROS 2's wheels.
+
+    Args:
+        packages: tf2_msgs, ackermann_msgs, or the folder of another package with its msg, srv and
+            action.
+        prefix: Folder to install into, with a setup.bash to source; by default this environment.
+
+    Examples:
+        nics install tf2_msgs
+        nics install tf2_msgs --prefix messages
+    """
     from nics_drl_bridge.commands.message_build import (
         Generators,
         check_programs,
@@ -68,7 +64,13 @@ def install(
     wheels = find_wheels()
     if wheels is None:
         extensions.require("nics install", "rclpy")
-        _refuse_without_wheels(sources[0].name)
+        name = sources[0].name
+        distribution = os.environ.get("ROS_DISTRO", "DISTRO")
+        debian = f"ros-{distribution}-{name.replace('_', '-')}"
+        raise ConfigError(
+            "nics install: the ROS 2 here does not come from wheels; install "
+            f"{name} with your distribution, as by `sudo apt install {debian}`."
+        )
     place = check_prefix(prefix or Path(sys.prefix))
     check_programs()
     with Generators(wheels, _tell) as generators:

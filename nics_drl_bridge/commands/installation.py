@@ -60,7 +60,18 @@ def checks() -> list[Check]:
     cores = Check(
         "cores", (usable or 1) > 1, f"{usable} of {os.cpu_count()} may be used", ""
     )
-    return [_check_python(), *_check_extras(), *_check_ros(), cores, _check_kernels()]
+    for name in COMPILED:
+        import_module(f"{PACKAGE}.{name}")
+    from nics_drl_bridge.kernels import KERNELS, SECONDS_EACH
+
+    cold = sum(not kernel.is_warm for kernel in KERNELS)
+    text = f"{len(KERNELS) - cold} of {len(KERNELS)} are compiled"
+    seconds = max(1, round(cold * SECONDS_EACH))
+    fix = (
+        f"nics warmup --all, about {seconds} s; else each is compiled at its first use"
+    )
+    kernels = Check("kernels", cold == 0, text, fix)
+    return [_check_python(), *_check_extras(), *_check_ros(), cores, kernels]
 
 
 def _check_python() -> Check:
@@ -99,23 +110,8 @@ def _check_ros() -> list[Check]:
     distribution = os.environ.get("ROS_DISTRO") or "from wheels"
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
     text = f"{distribution}, rclpy {release}, ROS_DOMAIN_ID {domain}"
-    messages = []
-    for name, purpose in MESSAGES.items():
-        messages.append(
-            Check(name, find_spec(name) is not None, purpose, explain_install(name))
-        )
+    messages = [
+        Check(name, find_spec(name) is not None, purpose, explain_install(name))
+        for name, purpose in MESSAGES.items()
+    ]
     return [Check("ROS 2", True, text), *messages]
-
-
-def _check_kernels() -> Check:
-    for name in COMPILED:
-        import_module(f"{PACKAGE}.{name}")
-    from nics_drl_bridge.kernels import KERNELS, SECONDS_EACH
-
-    cold = sum(not kernel.is_warm for kernel in KERNELS)
-    text = f"{len(KERNELS) - cold} of {len(KERNELS)} are compiled"
-    seconds = max(1, round(cold * SECONDS_EACH))
-    fix = (
-        f"nics warmup --all, about {seconds} s; else each is compiled at its first use"
-    )
-    return Check("kernels", cold == 0, text, fix)

@@ -1,9 +1,7 @@
 """`nics list`: shipped robots, worlds, lidars and policies, by the names that commands take."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from typer import Argument
+from typing import TYPE_CHECKING, Any, Literal
 
 from nics_drl_bridge.commands.console import JsonOption, format_table, print_line
 from nics_drl_bridge.config import list_shipped
@@ -17,10 +15,16 @@ Row = dict[str, Any]
 Listed = Literal["robots", "worlds", "lidars", "policies"]
 
 
-def list_(
-    what: Annotated[Listed, Argument(help="What to list.")], as_json: JsonOption = False
-) -> None:
-    """Lists the shipped robots, worlds, lidars or policies."""
+def list_(what: Listed, as_json: JsonOption = False) -> None:
+    """Lists the shipped robots, worlds, lidars or policies.
+
+    Args:
+        what: What to list.
+
+    Examples:
+        nics list robots
+        nics list worlds --json
+    """
     rows = ROWS[what]()
     cells = [tuple(map(str, row.values())) for row in rows]
     print_line(as_json, format_table(tuple(rows[0]), cells), **{what: rows})

@@ -53,6 +53,7 @@ USED_PACKAGE = re.compile(r"^([a-z][a-z0-9_]*)/", re.MULTILINE)
 # a type at the start of a line, with or without its package
 USED_TYPE = re.compile(r"^(?:([a-z][a-z0-9_]*)/(?:msg/)?)?([A-Z]\w*)", re.MULTILINE)
 BUILT_ON = re.compile(r"/opt/python/[^;\"]*?/(site-packages|include/python[0-9.]*)")
+PYTHON = f"python{sys.version_info[0]}.{sys.version_info[1]}"
 REASON_LINES = 3  # last lines of a failed command that are reported
 # Set by the wheels' bootstrapper; in child processes they would hide the generators' libraries.
 UNSET = (
@@ -176,12 +177,7 @@ def check_programs() -> None:
 
 def find_modules_folder(prefix: Path) -> Path:
     """Returns the folder of Python modules below a prefix."""
-    return (
-        prefix
-        / "lib"
-        / f"python{sys.version_info[0]}.{sys.version_info[1]}"
-        / "site-packages"
-    )
+    return prefix / "lib" / PYTHON / "site-packages"
 
 
 class Generators(AbstractContextManager["Generators", None]):
@@ -227,14 +223,12 @@ class Generators(AbstractContextManager["Generators", None]):
 
     def _name_own_folders(self) -> None:
         """Replaces paths of the machine that built the wheels by this environment's paths."""
-        include = f"{sys.base_prefix}/include/python{sys.version_info[0]}.{sys.version_info[1]}"
+        include = f"{sys.base_prefix}/include/{PYTHON}"
 
         def here(match: re.Match[str]) -> str:
-            return (
-                include
-                if match[1].startswith("include")
-                else str(find_modules_folder(self._prefix))
-            )
+            if match[1].startswith("include"):
+                return include
+            return str(find_modules_folder(self._prefix))
 
         for file in (self._prefix / "share").rglob("*.cmake"):
             text = file.read_text(encoding="utf-8")
@@ -246,10 +240,10 @@ class Generators(AbstractContextManager["Generators", None]):
         files = source.list_files()
         left_out = dict[Path, str]()
         for file in files:
-            used = sorted(source.find_used_packages(file))
-            missing = next((name for name in used if not self._has(name)), None)
-            if missing is not None:
-                left_out[file] = missing
+            for name in sorted(source.find_used_packages(file), reverse=True):
+                is_there = (self._prefix / "share" / name).is_dir()
+                if name not in self._built and not is_there:
+                    left_out[file] = name
         _leave_out_users(source, files, left_out)
         kept = [file.resolve() for file in files if file not in left_out]
         if not kept:
@@ -262,11 +256,6 @@ class Generators(AbstractContextManager["Generators", None]):
             needed.add("action_msgs")
         names = {file.name: missing for file, missing in left_out.items()}
         return Interfaces(source.name, kept, sorted(needed), names)
-
-    def _has(self, package: str) -> bool:
-        if package in self._built:
-            return True
-        return (self._prefix / "share" / package).is_dir()
 
     def build(self, interfaces: Interfaces, prefix: Path) -> None:
         """Builds a message package, and installs it below a prefix. Raises ConfigError."""
@@ -297,12 +286,8 @@ class Generators(AbstractContextManager["Generators", None]):
             command, env=self._environment, capture_output=True, text=True
         )
         if done.returncode:
-            lines = [
-                line
-                for line in (done.stdout + done.stderr).splitlines()
-                if line.strip()
-            ]
-            reason = shorten(" | ".join(lines[-REASON_LINES:]), 500)
+            lines = filter(str.strip, (done.stdout + done.stderr).splitlines())
+            reason = shorten(" | ".join([*lines][-REASON_LINES:]), 500)
             raise ConfigError(
                 f"{failed}: `{command[0]}` ended with {done.returncode}: {reason}"
             )

@@ -19,11 +19,7 @@ from nics_drl_bridge.nodes.parameters import STAMPED
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
-    from nics_drl_bridge.generator import SimulatorModel
-    from nics_drl_bridge.identify.identify import Identified
     from nics_drl_bridge.recording.excite import DrivePlan
-    from nics_drl_bridge.recording.recording import Recording
-    from nics_drl_bridge.recording.survey import TableSurvey
 
 
 SourceArgument = Annotated[
@@ -32,43 +28,41 @@ SourceArgument = Annotated[
 
 
 def record(
-    out: Annotated[
-        Path, Option(help="An .npz file, or the folder of a rosbag2, to write.")
-    ],
+    out: Annotated[Path, Option()],
     robot: console.RobotOption = DEFAULT_ROBOT,
-    bound: Annotated[
-        float, Option(help="Radius around the start to keep within [m].")
-    ] = defaults.DRIVE_BOUND_M,
-    duration: Annotated[
-        float, Option(help="Duration of the drive [s].")
-    ] = defaults.DRIVE_S,
-    speed: Annotated[
-        float, Option(help="Fraction of the maximum speeds to use.")
-    ] = 1.0,
-    seed: Annotated[int, Option(help="Seed of the pattern.")] = 0,
+    bound: float = defaults.DRIVE_BOUND_M,
+    duration: float = defaults.DRIVE_S,
+    speed: float = 1.0,
+    seed: int = 0,
     namespace: console.NamespaceOption = "",
-    remap: Annotated[
-        list[str] | None, Option(help="Rename a topic, as in odom:=/wheels.")
-    ] = None,
-    topics: Annotated[
-        Path | None, Option(help="YAML file: joints of the state and of the wheels.")
-    ] = None,
-    stamped: Annotated[
-        bool | None, Option(help="Send cmd_vel as TwistStamped.")
-    ] = None,
+    remap: list[str] | None = None,
+    topics: Path | None = None,
+    stamped: bool | None = None,
     imu: console.ImuOption = defaults.IMU_TOPIC,
-    use_sim_time: Annotated[
-        bool, Option("--use-sim-time", help="Take time from /clock.")
-    ] = False,
-    preview: Annotated[
-        bool, Option("--preview", help="Only show the planned drive.")
-    ] = False,
-    yes: Annotated[
-        bool, Option("--yes", help="Do not ask before the robot moves.")
-    ] = False,
+    use_sim_time: console.SimTimeOption = False,
+    preview: Annotated[bool, Option("--preview")] = False,
+    yes: console.YesOption = False,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Drives a robot through its full range of motion and records it."""
+    """Drives a robot through its full range of motion and records it.
+
+    Args:
+        out: An .npz file, or the folder of a rosbag2, to write.
+        robot: A shipped robot (see nics list robots) or a YAML file.
+        bound: Radius around the start to keep within [m].
+        duration: Duration of the drive [s].
+        speed: Fraction of the maximum speeds to use.
+        seed: Seed of the pattern.
+        remap: Rename a topic, as in odom:=/wheels.
+        topics: YAML file: joints of the state and of the wheels.
+        stamped: Send cmd_vel as TwistStamped.
+        preview: Only show the planned drive.
+        yes: Do not ask before the robot moves.
+
+    Examples:
+        nics record --robot my_robot.yaml --out drive.npz --preview
+        nics record --robot my_robot.yaml --out drive.npz --bound 2 --speed 0.3
+    """
     arguments = make_node_arguments(namespace, remap or ())
     parameters = {
         "robot": robot,
@@ -118,19 +112,14 @@ def record(
 def make_node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:
     """Returns `record_node`'s command line. Raises ConfigError for a malformed remapping rule."""
     space = parse_namespace(namespace)
-    rules = [f"__ns:={space}"] if space else []
+    rules = ["-r", f"__ns:={space}"] if space else []
     for rule in remap:
         if not all(rule.partition(":=")):
             raise ConfigError(
                 f"--remap {rule!r}: must be NAME:=OTHER, as in odom:=/wheel_odom."
             )
-        rules.append(rule)
-    if not rules:
-        return ["nics"]
-    arguments = ["nics", "--ros-args"]
-    for rule in rules:
-        arguments += ["-r", rule]
-    return arguments
+        rules += ["-r", rule]
+    return ["nics", "--ros-args", *rules] if rules else ["nics"]
 
 
 def draw_preview(plan: "DrivePlan", out: Path) -> tuple[str, ...]:
@@ -165,25 +154,19 @@ def drive_summary(recording: Any, parameters: dict[str, Any]) -> tuple[str, ...]
     )
 
 
-def _print_table(table: "TableSurvey") -> None:
-    findings = "".join(
-        f"\n  {finding}" for finding in table.regularity + table.findings
-    )
-    typer.echo(f"{table.name}: {table.rows} rows{findings}")
-    rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
-    if rows:
-        typer.echo(console.format_table(("column", "minimum", "maximum"), rows))
-
-
 def inspect(
     source: SourceArgument,
-    mapping: Annotated[
-        Path | None,
-        Option("--map", help="YAML file to write: a draft mapping, with guesses."),
-    ] = None,
+    mapping: Annotated[Path | None, Option("--map")] = None,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Lists the contents of any recording and drafts its mapping."""
+    """Lists the contents of any recording and drafts its mapping.
+
+    Args:
+        mapping: YAML file to write: a draft mapping, with guesses.
+
+    Examples:
+        nics inspect drive.csv --map drive.yaml
+    """
     from nics_drl_bridge.files import write_text
     from nics_drl_bridge.recording.mapping_draft import propose_mapping
     from nics_drl_bridge.recording.readers import explain_no_mapping, open_source
@@ -219,7 +202,11 @@ def inspect(
     for line in (*([needless] if needless else ()), *doubts):
         typer.echo(line)
     for table in tables:
-        _print_table(table)
+        findings = (f"\n  {line}" for line in table.regularity + table.findings)
+        typer.echo(f"{table.name}: {table.rows} rows{''.join(findings)}")
+        rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
+        if rows:
+            typer.echo(console.format_table(("column", "minimum", "maximum"), rows))
     if draft is None:
         typer.echo(
             f"no mapping was written: {needless}" if mapping is not None else needless
@@ -239,11 +226,19 @@ def inspect(
 
 def import_(
     source: SourceArgument,
-    mapping: Annotated[Path, Option("--map", help="YAML mapping, docs/recordings.md.")],
-    out: Annotated[Path, Option(help="The .npz file to write.")],
+    mapping: Annotated[Path, Option("--map")],
+    out: Annotated[Path, Option()],
     as_json: console.JsonOption = False,
 ) -> None:
-    """Converts a recording of any format to .npz, using its mapping."""
+    """Converts a recording of any format to .npz, using its mapping.
+
+    Args:
+        mapping: YAML mapping, docs/recordings.md.
+        out: The .npz file to write.
+
+    Examples:
+        nics import drive.csv --map drive.yaml --out drive.npz
+    """
     from nics_drl_bridge.recording.readers import read_recording
     from nics_drl_bridge.recording.recording import save_recording
     from nics_drl_bridge.recording.write import check_out
@@ -253,7 +248,17 @@ def import_(
     with console.show_progress(f"reading {source}"):
         drive = read_recording(source, mapping=mapping)
         save_recording(drive, out)
-    streams = stream_facts(drive)
+    streams: list[dict[str, Any]] = [
+        {
+            "stream": name,
+            "rows": len(s.t),
+            "rate_hz": (len(s.t) - 1) / max(float(s.t[-1] - s.t[0]), 1e-9),
+            "from_s": float(s.t[0]),
+            "to_s": float(s.t[-1]),
+            "clock": s.clock,
+        }
+        for name, s in drive.streams.items()
+    ]
     rows = [
         (
             s["stream"],
@@ -270,74 +275,47 @@ def import_(
     console.print_line(as_json, text, recording=str(out), **facts)
 
 
-def stream_facts(drive: "Recording") -> list[dict[str, Any]]:
-    """Returns each stream's name, number of rows, rate, first and last time, and clock."""
-    return [
-        {
-            "stream": name,
-            "rows": len(s.t),
-            "rate_hz": (len(s.t) - 1) / max(float(s.t[-1] - s.t[0]), 1e-9),
-            "from_s": float(s.t[0]),
-            "to_s": float(s.t[-1]),
-            "clock": s.clock,
-        }
-        for name, s in drive.streams.items()
-    ]
-
-
 def generate(
-    recording: Annotated[
-        list[Path],
-        Argument(
-            help="A bag, an .npz recording, or tables with a --map; several of one robot."
-        ),
-    ],
-    out: Annotated[Path, Option(help="Folder of the model to write.")],
-    robot: console.DrivenRobotOption = None,
-    mapping: Annotated[
-        Path | None,
-        Option("--map", help="YAML mapping of the recording, docs/recordings.md."),
-    ] = None,
-    topics: console.TopicsOption = None,
+    recording: list[Path],
+    out: Annotated[Path, Option()],
+    robot: console.OptionalRobotOption = None,
+    mapping: Annotated[Path | None, Option("--map")] = None,
+    topics: Path | None = None,
     topic: console.TopicOption = None,
-    world: console.WorldOption = defaults.WORLD,
+    world: Annotated[str, console.WORLD] = defaults.WORLD,
     lidar: console.LidarOption = None,
-    sensor: Annotated[
-        list[Path] | None,
-        Option(help="YAML of an additional sensor, docs/sensors.md; repeatable."),
-    ] = None,
-    order: Annotated[
-        str, Option(help="Order of the Taylor model, 1 to 4, or auto.")
-    ] = defaults.TAYLOR_ORDER,
-    alpha: Annotated[
-        str,
-        Option(
-            help="Pruning of Eq. 2, 0 to 1, or auto for the knee; "
-            "no effect where the motion is the state."
-        ),
-    ] = defaults.PRUNING,
-    assume_textbook: Annotated[
-        bool,
-        Option(
-            help="Complete the model from the textbook where the drive shows nothing."
-        ),
-    ] = False,
-    strict: Annotated[
-        bool, Option(help="Fail if an input was not varied independently.")
-    ] = False,
-    anyway: Annotated[
-        bool,
-        Option(
-            "--anyway",
-            help="Write the model even if it predicts unseen data badly.",
-        ),
-    ] = False,
-    pictures: Annotated[
-        bool, Option(help="Draw the fit into the model's pictures/.")
-    ] = False,
+    sensor: list[Path] | None = None,
+    order: str = defaults.TAYLOR_ORDER,
+    alpha: str = defaults.PRUNING,
+    assume_textbook: bool = False,
+    strict: bool = False,
+    anyway: Annotated[bool, Option("--anyway")] = False,
+    pictures: bool = False,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Generates a simulator from recordings and writes its folder."""
+    """Generates a simulator from recordings and writes its folder.
+
+    Args:
+        recording: A bag, an .npz recording, or tables with a --map; several of one robot.
+        out: Folder of the model to write.
+        robot: Shipped, or a YAML file; else the recording's own, or differential.
+        mapping: YAML mapping of the recording, docs/recordings.md.
+        topics: YAML file: a bag's topic for each role.
+        world: A shipped world or a YAML file.
+        lidar: A shipped lidar or a YAML file; else the robot's own, or paper.
+        sensor: YAML of an additional sensor, docs/sensors.md; repeatable.
+        order: Order of the Taylor model, 1 to 4, or auto.
+        alpha: Pruning of Eq. 2, 0 to 1, or auto for the knee; no effect where the motion is the
+            state.
+        assume_textbook: Complete the model from the textbook where the drive shows nothing.
+        strict: Fail if an input was not varied independently.
+        anyway: Write the model even if it predicts unseen data badly.
+        pictures: Draw the fit into the model's pictures/.
+
+    Examples:
+        nics generate drive.npz --robot ackermann --out my_robot
+        nics generate drive.csv --map drive.yaml --out my_robot
+    """
     from nics_drl_bridge.generator import check_place, mount_lidar, save_model
     from nics_drl_bridge.generator import generate as generate_model
     from nics_drl_bridge.identify.fit import parse_alpha, parse_order
@@ -358,7 +336,10 @@ def generate(
     chosen = choose_mapping(load_topic_roles(topics, topic or ()), mapping)
     with console.show_progress(f"reading {named}"):
         spec, drives = open_drives(recording, robot, chosen)
-    drives = _name_drives(drives, recording)
+    drives = [
+        replace(drive, source=name)
+        for drive, name in zip(drives, names_of_sources(recording), strict=True)
+    ]
     with console.show_progress("generating"):
         model, identified = generate_model(
             drives if len(drives) > 1 else drives[0],
@@ -373,6 +354,11 @@ def generate(
             sensors,
         )
         save_model(model, out)
+    from nics_drl_bridge.identify.report import (
+        conclude,
+        format_equations,
+        format_opening,
+    )
     from nics_drl_bridge.report.fit_page import write_fit_page
     from nics_drl_bridge.report.fit_pictures import write_pictures
 
@@ -380,38 +366,23 @@ def generate(
         write_fit_page(out / "report.html", named, spec, identified, model.report)
         if pictures:
             write_pictures(spec, identified, out / "pictures")
-    default = not (lidar or spec.lidar)
-    console.print_line(
-        as_json,
-        _describe_written(out, model, identified, default),
-        **fit_facts(out, spec.name, identified),
-    )
-
-
-def _name_drives(
-    drives: Sequence["Recording"], recordings: Sequence[Path]
-) -> list["Recording"]:
-    """Returns drives with the names of their recordings as sources."""
-    names = names_of_sources(recordings)
-    return [
-        replace(drive, source=name) for drive, name in zip(drives, names, strict=True)
-    ]
-
-
-def _describe_written(
-    out: Path, model: "SimulatorModel", identified: "Identified", default: bool
-) -> str:
-    """Returns what to print about a written model; `default`: nobody chose its lidar."""
-    from nics_drl_bridge.identify.report import format_opening
-
-    why = ", the default; choose another with --lidar" if default else ""
+    why = ", the default; choose another with --lidar"
     lines = (
         f"{format_opening(identified.recording.source, identified)}\n",
-        f"its lidar is {model.lidar.name!r}{why}",
+        f"its lidar is {model.lidar.name!r}{'' if lidar or spec.lidar else why}",
         f"all figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}",
         f"model written to {out}",
     )
-    return "\n".join(lines)
+    facts = {
+        "model": str(out),
+        "robot": spec.name,
+        **conclude(identified)._asdict(),
+        "equations": format_equations(identified.model),
+        "errors": [asdict(error) for error in identified.judgement],
+        "report": str(out / "report.txt"),
+        "page": str(out / "report.html"),
+    }
+    console.print_line(as_json, "\n".join(lines), **facts)
 
 
 def names_of_sources(recordings: Sequence[Path]) -> list[str]:
@@ -424,40 +395,29 @@ def names_of_sources(recordings: Sequence[Path]) -> list[str]:
     return [str(path) for path in recordings]
 
 
-def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]:
-    """Returns the conclusion, equations and errors of a fit."""
-    from nics_drl_bridge.identify.report import conclude, format_equations
-
-    return {
-        "model": str(out),
-        "robot": robot,
-        **conclude(identified)._asdict(),
-        "equations": format_equations(identified.model),
-        "errors": [asdict(error) for error in identified.judgement],
-        "report": str(out / "report.txt"),
-        "page": str(out / "report.html"),
-    }
-
-
 def drive(
-    out: Annotated[
-        Path | None, Option(help="Folder to write; by default <robot>_model.")
-    ] = None,
+    out: Path | None = None,
     robot: console.RobotOption = DEFAULT_ROBOT,
-    recording: Annotated[
-        Path | None,
-        Option(help="An .npz to save the drive in, like one of a real robot."),
-    ] = None,
+    recording: Path | None = None,
     lidar: console.LidarOption = None,
-    duration: Annotated[
-        float, Option(min=5.0, max=3600.0, help="Duration [s].")
-    ] = defaults.DRIVE_S,
-    seed: Annotated[int, Option(min=0, help="Seed of the random commands.")] = 0,
+    duration: Annotated[float, Option(min=5.0, max=3600.0)] = defaults.DRIVE_S,
+    seed: console.SeedOption = 0,
     as_json: console.JsonOption = False,
 ) -> None:
     """Generates a simulator from a drive of a robot's textbook model.
 
     For training without a recording; `nics generate` makes a more accurate simulator from one.
+
+    Args:
+        out: Folder to write; by default <robot>_model.
+        robot: A shipped robot (see nics list robots) or a YAML file.
+        recording: An .npz to save the drive in, like one of a real robot.
+        lidar: A shipped lidar or a YAML file; else the robot's own, or paper.
+        duration: Duration [s].
+        seed: Seed of the random commands.
+
+    Examples:
+        nics drive --robot my_robot.yaml --out my_robot
     """
     import numpy as np
 
@@ -490,19 +450,19 @@ def drive(
 
 
 def urdf(
-    model: Annotated[
-        str,
-        Argument(
-            autocompletion=console.ROBOTS,
-            help="A shipped robot, or the folder of a model.",
-        ),
-    ],
-    out: Annotated[
-        Path | None, Option(help="File to write; by default <robot>.urdf.")
-    ] = None,
+    model: Annotated[str, Argument(autocompletion=console.ROBOTS)],
+    out: Path | None = None,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Writes a robot's URDF, for RViz and robot_state_publisher."""
+    """Writes a robot's URDF, for RViz and robot_state_publisher.
+
+    Args:
+        model: A shipped robot, or the folder of a model.
+        out: File to write; by default <robot>.urdf.
+
+    Examples:
+        nics urdf my_robot --out my_robot.urdf
+    """
     from nics_drl_bridge.files import write_text
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.robot.urdf import make_urdf

@@ -4,7 +4,7 @@ from functools import partial
 from typing import Annotated
 
 import typer
-from typer import Argument, Option
+from typer import Option
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands import console
@@ -22,16 +22,19 @@ _tell = partial(typer.echo, err=True)
 
 def arm(
     namespace: console.NamespaceOption = "",
-    reset: Annotated[
-        bool,
-        Option(
-            "--reset", help="First release a latched stop, for example of nics stop."
-        ),
-    ] = False,
+    reset: Annotated[bool, Option("--reset")] = False,
     wait: WaitOption = CONSENT_S,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Arms command_gate, or explains why it refuses."""
+    """Arms command_gate, or explains why it refuses.
+
+    Args:
+        reset: First release a latched stop, for example of nics stop.
+
+    Examples:
+        nics arm
+        nics arm --reset --namespace ant
+    """
     parse_namespace(namespace)
     with extensions.require_modules("nics arm"):
         from nics_drl_bridge.nodes.operator import Operator
@@ -45,16 +48,19 @@ def arm(
 
 
 def stop(
-    namespace: Annotated[
-        str | None,
-        Option(
-            help="Namespace of the robot to stop; by default all robots are stopped."
-        ),
-    ] = None,
+    namespace: str | None = None,
     wait: WaitOption = 5.0,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Stops one robot, or all, through the emergency stop of its gate."""
+    """Stops one robot, or all, through the emergency stop of its gate.
+
+    Args:
+        namespace: Namespace of the robot to stop; by default all robots are stopped.
+
+    Examples:
+        nics stop
+        nics stop --namespace ant
+    """
     parse_namespace(namespace or "")
     with extensions.require_modules("nics stop"):
         from nics_drl_bridge.nodes.operator import Operator
@@ -81,24 +87,26 @@ def _describe_stop(gate: str) -> str:
 
 
 def goal(
-    x: Annotated[float, Argument(help="Ahead, along the x axis of the frame [m].")],
-    y: Annotated[float, Argument(help="To the left, along its y axis [m].")],
-    yaw: Annotated[
-        float,
-        Option(help="Heading at the goal [rad]; policies of this package ignore it."),
-    ] = 0.0,
-    frame: Annotated[
-        str,
-        Option(
-            metavar="FRAME",
-            help="Frame of the goal: map (default), odom, base_link, ...",
-        ),
-    ] = "",
+    x: float,
+    y: float,
+    yaw: float = 0.0,
+    frame: Annotated[str, Option(metavar="FRAME")] = "",
     namespace: console.NamespaceOption = "",
     wait: WaitOption = CONSENT_S,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Sends a goal, and reports whether policy_node accepts it."""
+    """Sends a goal, and reports whether policy_node accepts it.
+
+    Args:
+        x: Ahead, along the x axis of the frame [m].
+        y: To the left, along its y axis [m].
+        yaw: Heading at the goal [rad]; policies of this package ignore it.
+        frame: Frame of the goal: map (default), odom, base_link, ...
+
+    Examples:
+        nics goal 1 0
+        nics goal 2 -0.5 --frame base_link --namespace ant
+    """
     parse_namespace(namespace)
     with extensions.require_modules("nics goal"):
         from nics_drl_bridge.nodes.operator import GoalRequest, Operator

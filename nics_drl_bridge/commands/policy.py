@@ -10,8 +10,8 @@ from typer import Argument, Option
 from nics_drl_bridge.commands.console import (
     POLICIES,
     JsonOption,
+    OptionalRobotOption,
     PolicyFileArgument,
-    make_robot_option,
     print_line,
 )
 from nics_drl_bridge.errors import ConfigError
@@ -24,16 +24,17 @@ policy = typer.Typer(
 
 @policy.command()
 def info(
-    file: Annotated[
-        str,
-        Argument(
-            autocompletion=POLICIES,
-            help="A policy file, the name of a shipped one, or a foreign one's mapping.",
-        ),
-    ],
+    file: Annotated[str, Argument(autocompletion=POLICIES)],
     as_json: JsonOption = False,
 ) -> None:
-    """Checks a policy file and shows its training and requirements."""
+    """Checks a policy file and shows its training and requirements.
+
+    Args:
+        file: A policy file, the name of a shipped one, or a foreign one's mapping.
+
+    Examples:
+        nics policy info differential --json
+    """
     from nics_drl_bridge.policy.file.policy_file import load_policy, summary
 
     facts = summary(load_policy(file))
@@ -47,12 +48,17 @@ def info(
 @policy.command()
 def export(
     file: PolicyFileArgument,
-    leapp: Annotated[
-        Path, Option(help="Folder of the bundle: network, YAML file, start values.")
-    ],
+    leapp: Annotated[Path, Option()],
     as_json: JsonOption = False,
 ) -> None:
-    """Converts a policy file to another format: Isaac's LEAPP."""
+    """Converts a policy file to another format: Isaac's LEAPP.
+
+    Args:
+        leapp: Folder of the bundle: network, YAML file, start values.
+
+    Examples:
+        nics policy export policy.onnx --leapp bundle
+    """
     from nics_drl_bridge.policy.file.policy_file import foreign_policies, load_policy
 
     written = str(foreign_policies().export_bundle(load_policy(file), leapp))
@@ -61,20 +67,21 @@ def export(
 
 @policy.command(name="import")
 def import_(
-    source: Annotated[
-        Path,
-        Argument(help="A LEAPP bundle, or the mapping (YAML) of a foreign policy."),
-    ],
-    out: Annotated[
-        Path, Option("--out", "-o", help="The policy file to write (*.onnx).")
-    ],
-    robot: Annotated[
-        str | None,
-        make_robot_option("A shipped robot, or the folder of a model."),
-    ] = None,
+    source: Path,
+    out: Annotated[Path, Option("--out", "-o")],
+    robot: OptionalRobotOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Makes a policy file from a policy trained elsewhere."""
+    """Makes a policy file from a policy trained elsewhere.
+
+    Args:
+        source: A LEAPP bundle, or the mapping (YAML) of a foreign policy.
+        out: The policy file to write (*.onnx).
+        robot: A shipped robot, or the folder of a model.
+
+    Examples:
+        nics policy import bundle --robot my_robot --out policy.onnx
+    """
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.file.contract import SUFFIX
     from nics_drl_bridge.policy.file.policy_file import foreign_policies, policy_of

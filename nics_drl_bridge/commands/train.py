@@ -19,7 +19,6 @@ from nics_drl_bridge.commands.first_checks import check_settings, check_training
 from nics_drl_bridge.commands.interrupts import was_interrupted
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.files import format_json
-from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 DEFAULT_EPISODES = 500
 # PPO engines in this process, see `policy.train.settings.PpoSettings`
@@ -28,65 +27,47 @@ OWN = ("lean", "sb3")
 
 def train(
     more_seeds: Annotated[list[str] | None, Argument(hidden=True)] = None,
-    task: Annotated[
-        str, Option(help="A task, or path/to/file.py:ClassName.")
-    ] = defaults.TASK,
-    robot: Annotated[
-        str | None,
-        console.make_robot_option(
-            f"A shipped robot ({DEFAULT_ROBOT}), a YAML file, or the folder of a model."
-        ),
-    ] = None,
+    task: str = defaults.TASK,
+    robot: console.OptionalRobotOption = None,
     settings: Annotated[
-        str | None,
-        Option(
-            help="Shipped settings (navigation_differential), or a YAML file; else those of the "
-            "robot, or of the shipped robot that moves like it.",
-            autocompletion=console.complete_names("training"),
-        ),
+        str | None, Option(autocompletion=console.complete_names("training"))
     ] = None,
-    world: Annotated[
-        list[str] | None,
-        Option(
-            autocompletion=console.WORLDS,
-            help="Train in this world only; repeat to train in several.",
-        ),
-    ] = None,
-    algorithm: Annotated[str | None, Option(help="ppo or sac.")] = None,
-    seeds: Annotated[
-        list[int] | None, Option(help="One or more: --seeds 0 1 2.")
-    ] = None,
-    steps: Annotated[int | None, Option(min=1, help="Environment steps.")] = None,
-    episodes: Annotated[
-        int, Option(min=1, help="Evaluation episodes in each world.")
-    ] = DEFAULT_EPISODES,
-    out: Annotated[Path | None, Option(help="Folder of the run.")] = None,
-    resume: Annotated[bool, Option(help="Continue an interrupted --out.")] = False,
-    engine: Annotated[
-        str | None,
-        Option(
-            help="lean or sb3 (Stable-Baselines3), in this process; ray: a cluster."
-        ),
-    ] = None,
-    address: Annotated[
-        str | None,
-        Option(help="Ray cluster: auto (this machine's) or HOST:PORT; else a new one."),
-    ] = None,
-    env_runners: Annotated[
-        int | None,
-        Option(
-            min=1, help="Ray processes that share the worlds; default: one per CPU."
-        ),
-    ] = None,
+    world: Annotated[list[str] | None, Option(autocompletion=console.WORLDS)] = None,
+    algorithm: str | None = None,
+    seeds: list[int] | None = None,
+    steps: console.OptionalCountOption = None,
+    episodes: console.CountOption = DEFAULT_EPISODES,
+    out: Path | None = None,
+    resume: bool = False,
+    engine: str | None = None,
+    address: str | None = None,
+    env_runners: console.OptionalCountOption = None,
     as_json: console.JsonOption = False,
-    watch: Annotated[
-        bool,
-        Option(
-            "--watch", help="Show some of the worlds on a page, as nics watch does."
-        ),
-    ] = False,
+    watch: Annotated[bool, Option("--watch")] = False,
 ) -> None:
-    """Trains policies in the fast simulator, and evaluates them."""
+    """Trains policies in the fast simulator, and evaluates them.
+
+    Args:
+        task: A task, or path/to/file.py:ClassName.
+        robot: A shipped robot (differential), a YAML file, or the folder of a model.
+        settings: Shipped settings (navigation_differential), or a YAML file; else those of the
+            robot, or of the shipped robot that moves like it.
+        world: Train in this world only; repeat to train in several.
+        algorithm: ppo or sac.
+        seeds: One or more: --seeds 0 1 2.
+        steps: Environment steps.
+        episodes: Evaluation episodes in each world.
+        out: Folder of the run.
+        resume: Continue an interrupted --out.
+        engine: lean or sb3 (Stable-Baselines3), in this process; ray: a cluster.
+        address: Ray cluster: auto (this machine's) or HOST:PORT; else a new one.
+        env_runners: Ray processes that share the worlds; default: one per CPU.
+        watch: Show some of the worlds on a page, as nics watch does.
+
+    Examples:
+        nics train --robot differential --world circles --out runs/first
+        nics train --robot my_robot.yaml --world doorway --out runs/mine
+    """
     named = _keep_given(
         robot=robot,
         algorithm=algorithm,
@@ -96,8 +77,11 @@ def train(
     )
     if resume:
         _check_resumed(out, bool(settings), named)
-    if watch:
-        _check_watched(engine)
+    if watch and engine not in (None, *OWN):
+        raise ConfigError(
+            f"--watch --engine {engine}: worlds of other processes are not shown; "
+            "leave out --watch, or --engine."
+        )
     further_seeds = seeds_of_words(more_seeds or [], seeds is not None)
     check_training(task, robot, world or [], [*(seeds or []), *further_seeds], out)
     check_engine(engine, {"address": address, "env-runners": env_runners})
@@ -147,15 +131,6 @@ def train(
 def _keep_given(**options: object) -> dict[str, Any]:
     """Returns the options that were given."""
     return {name: value for name, value in options.items() if value}
-
-
-def _check_watched(engine: str | None) -> None:
-    """Raises ConfigError for an engine whose worlds can't be shown."""
-    if engine is not None and engine not in OWN:
-        reason = (
-            "worlds of other processes are not shown; leave out --watch, or --engine"
-        )
-        raise ConfigError(f"--watch --engine {engine}: {reason}.")
 
 
 def _check_resumed(

@@ -34,21 +34,20 @@ def up(
             ],
         ),
     ],
-    arguments: Annotated[
-        list[str] | None,
-        Argument(
-            metavar="NAME:=VALUE...",
-            help="Arguments, the same as those of the launch files.",
-        ),
-    ] = None,
-    show_args: Annotated[
-        bool,
-        Option(
-            "--show-args", help="List the arguments and their defaults; start nothing."
-        ),
-    ] = False,
+    arguments: Annotated[list[str] | None, Argument(metavar="NAME:=VALUE...")] = None,
+    show_args: Annotated[bool, Option("--show-args")] = False,
 ) -> None:
-    """Starts the nodes of a simulation, vehicle or fleet."""
+    """Starts the nodes of a simulation, vehicle or fleet.
+
+    Args:
+        arguments: Arguments, the same as those of the launch files.
+        show_args: List the arguments and their defaults; start nothing.
+
+    Examples:
+        nics up simulation world:=corridor
+        nics up fleet robots:='[ant, bee]'
+        nics up vehicle model:=my_car params_file:=car.yaml
+    """
     if what not in LAUNCHES:
         raise ConfigError(f"nics up can't start {what!r}; {suggest(what, LAUNCHES)}")
     launch = LAUNCHES[what]

@@ -9,43 +9,32 @@ from multiprocessing import get_context
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 
 from nics_drl_bridge.commands.console import JsonOption, show_progress
 from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 WORKERS = 2  # processes that compile at once; each needs a gigabyte
-AllOption = Annotated[
-    bool,
-    typer.Option(
-        "--all",
-        help="Compile those of the planners, the gate and the estimator too, as a robot needs.",
-    ),
-]
-DemoOption = Annotated[
-    bool,
-    typer.Option(
-        "--for-demo",
-        help="Compile what nics demo needs: also training, estimator and gate.",
-        hidden=True,
-    ),
-]
-WheelOption = Annotated[
-    bool,
-    typer.Option(
-        "--for-wheel",
-        help="All for x86-64-v3, into the package's folder, for `make wheel`.",
-    ),
-]
 
 
 def warmup(
-    all_kernels: AllOption = False,
-    for_demo: DemoOption = False,
-    for_wheel: WheelOption = False,
+    all_kernels: Annotated[bool, Option("--all")] = False,
+    for_demo: Annotated[bool, Option("--for-demo", hidden=True)] = False,
+    for_wheel: Annotated[bool, Option("--for-wheel")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compiles the simulator in advance, once per machine."""
+    """Compiles the simulator in advance, once per machine.
+
+    Args:
+        all_kernels: Compile those of the planners, the gate and the estimator too, as a robot
+            needs.
+        for_demo: Compile what nics demo needs: also training, estimator and gate.
+        for_wheel: All for x86-64-v3, into the package's folder, for `make wheel`.
+
+    Examples:
+        nics warmup
+    """
     begin = time.monotonic()
     # numba reads these at its import. It makes an error message for each type that it tries.
     os.environ["NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING"] = "1"

@@ -27,36 +27,41 @@ def watch(
             autocompletion=console.POLICIES,
         ),
     ] = None,
-    model: console.PolicyModelOption = None,
-    world: Annotated[
-        list[str] | None,
-        console.make_world_option(
-            f"A shipped world ({defaults.EVALUATION_WORLD}) or a YAML file; several "
-            "times: side by side.",
-        ),
-    ] = None,
-    seed: console.FirstSeedOption = defaults.EVALUATION_SEED,
-    lidar: console.OtherLidarOption = None,
+    model: console.OptionalRobotOption = None,
+    world: console.WorldsOption = None,
+    seed: console.SeedOption = defaults.EVALUATION_SEED,
+    lidar: console.LidarOption = None,
     randomisation: console.RandomisationOption = None,
     gate: console.GateOption = None,
     task: console.TaskOption = None,
-    ros: Annotated[bool, Option("--ros", help="Show live topics instead.")] = False,
+    ros: Annotated[bool, Option("--ros")] = False,
     namespace: console.NamespaceOption = "",
-    bag: Annotated[Path | None, Option(help="Show a recorded drive instead.")] = None,
+    bag: Path | None = None,
     topic: console.RolesOption = None,
-    record: Annotated[
-        Path | None,
-        Option(metavar="FILE", help="Write .mp4 or .gif instead of a page."),
-    ] = None,
-    episodes: Annotated[
-        int, Option(min=1, help="For --record: number of episodes.")
-    ] = 1,
-    port: Annotated[
-        int, Option(min=0, max=65535, help="Port of the page; 0 takes any.")
-    ] = defaults.PAGE_PORT,
-    browser: Annotated[bool, Option(help="Open the page in a browser.")] = True,
+    record: Annotated[Path | None, Option(metavar="FILE")] = None,
+    episodes: console.CountOption = 1,
+    port: Annotated[int, Option(min=0, max=65535)] = defaults.PAGE_PORT,
+    browser: bool = True,
 ) -> None:
-    """Shows a policy, live topics or a bag on a page in the browser."""
+    """Shows a policy, live topics or a bag on a page in the browser.
+
+    Args:
+        model: A model's folder, or a shipped robot; else the policy's own.
+        world: A shipped world or a YAML file; several times: side by side.
+        seed: Seed of the first episode.
+        lidar: A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.
+        ros: Show live topics instead.
+        bag: Show a recorded drive instead.
+        record: Write .mp4 or .gif instead of a page.
+        episodes: For --record: number of episodes.
+        port: Port of the page; 0 takes any.
+        browser: Open the page in a browser.
+
+    Examples:
+        nics watch differential --world circles
+        nics watch --bag drive
+        nics watch jackal --world clutter --record episode.gif
+    """
     if record is None:  # first, because opening the source may take a while
         extensions.require("the page", "websockets")
     else:

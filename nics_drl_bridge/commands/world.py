@@ -65,32 +65,13 @@ class Written(NamedTuple):
 
 @world.command("import")
 def import_(
-    files: Annotated[
-        list[Path],
-        Argument(
-            metavar="FILE...",
-            help="Gazebo's .world or .sdf, Nav2's map .yaml, or a picture.",
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        Option(
-            help="The .yaml to write, or a folder; by default in this folder, named after the file."
-        ),
-    ] = None,
-    name: Annotated[
-        str | None, Option(help="Name of the world; else that of the file.")
-    ] = None,
+    files: Annotated[list[Path], Argument(metavar="FILE...")],
+    out: Path | None = None,
+    name: str | None = None,
     start: Annotated[
-        tuple[float, float, float] | None,
-        Option(
-            metavar="X Y HEADING", help="Where robots start [m, rad]; else anywhere."
-        ),
+        tuple[float, float, float] | None, Option(metavar="X Y HEADING")
     ] = None,
-    goal: Annotated[
-        tuple[float, float] | None,
-        Option(metavar="X Y", help="Position of the goal [m]; else anywhere."),
-    ] = None,
+    goal: Annotated[tuple[float, float] | None, Option(metavar="X Y")] = None,
     goal_distance: Annotated[
         tuple[float, float] | None,
         Option(
@@ -99,43 +80,35 @@ def import_(
             f"{defaults.IMPORT_GOAL_DISTANCE_M:g} m on.",
         ),
     ] = None,
-    clearance: Annotated[
-        float, Option(help="Free space around the footprint [m].")
-    ] = defaults.IMPORT_CLEARANCE_M,
-    height: Annotated[
-        float,
-        Option(
-            help="For SDF: height above z = 0 at which geometry is cut, the lidar's [m]."
-        ),
-    ] = HEIGHT,
+    clearance: float = defaults.IMPORT_CLEARANCE_M,
+    height: float = HEIGHT,
     bounds: Annotated[
-        tuple[float, float, float, float] | None,
-        Option(
-            metavar="X1 Y1 X2 Y2",
-            help="For SDF: the field [m]; by default around all obstacles.",
-        ),
+        tuple[float, float, float, float] | None, Option(metavar="X1 Y1 X2 Y2")
     ] = None,
-    without: Annotated[
-        list[str] | None,
-        Option(
-            metavar="MODEL",
-            help="For SDF: a model to leave out, such as a robot; * matches anything. "
-            "May be given several times.",
-        ),
-    ] = None,
-    skip_unknown: Annotated[
-        bool,
-        Option(
-            "--skip-unknown",
-            help="For SDF: skip and list meshes and other unsupported shapes.",
-        ),
-    ] = False,
-    resolution: Annotated[
-        float | None, Option(help="For a picture: side of a pixel [m].")
-    ] = None,
+    without: Annotated[list[str] | None, Option(metavar="MODEL")] = None,
+    skip_unknown: Annotated[bool, Option("--skip-unknown")] = False,
+    resolution: float | None = None,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Imports Gazebo worlds, Nav2 maps, or pictures as worlds."""
+    """Imports Gazebo worlds, Nav2 maps, or pictures as worlds.
+
+    Args:
+        files: Gazebo's .world or .sdf, Nav2's map .yaml, or a picture.
+        out: The .yaml to write, or a folder; by default in this folder, named after the file.
+        name: Name of the world; else that of the file.
+        start: Where robots start [m, rad]; else anywhere.
+        goal: Position of the goal [m]; else anywhere.
+        clearance: Free space around the footprint [m].
+        height: For SDF: height above z = 0 at which geometry is cut, the lidar's [m].
+        bounds: For SDF: the field [m]; by default around all obstacles.
+        without: For SDF: a model to leave out, such as a robot; * matches anything. May be given
+            several times.
+        skip_unknown: For SDF: skip and list meshes and other unsupported shapes.
+        resolution: For a picture: side of a pixel [m].
+
+    Examples:
+        nics world import house.world --out house.yaml
+    """
     from nics_drl_bridge.sim.sdf import read_sdf
 
     keys = {
@@ -253,58 +226,56 @@ def _format_world(
 
     Raises ConfigError that names the imported file, because the new one does not exist yet.
     """
-    from nics_drl_bridge.config import dump_yaml
+    from nics_drl_bridge.config import dump_yaml, parse_yaml, validate
+    from nics_drl_bridge.sim.world import World, check_places
 
     far = round(math.hypot(*size), 3)
+    least = min(defaults.IMPORT_GOAL_DISTANCE_M, round(far / 4.0, 3))
     if {"starts", "goals"} <= set(values):
         least = 0.0
-    else:
-        least = min(defaults.IMPORT_GOAL_DISTANCE_M, round(far / 4.0, 3))
     values = {"goal_distance": (least, far), **values}
     comments = [f"# {' '.join(line.split())}\n" for line in head]
     ordered = {key: values[key] for key in KEYS if key in values}
     text = "".join(comments) + dump_yaml(ordered, one_line_rows=True)
     obstacles = sum(len(group["at"]) for group in values.get("obstacles", ()))
-    _read_back(file, text, obstacles)
-    return text
-
-
-def _read_back(file: Path, text: str, obstacles: int) -> None:
-    """Reads a world's text. Raises ConfigError that names the file from which it was made."""
-    from nics_drl_bridge.config import parse_yaml, validate
-    from nics_drl_bridge.sim.world import World, check_places
-
     made = f"{file}: the world made of it"
     try:
         data = parse_yaml(text, made)
     except ConfigError:
         if not obstacles:
             raise
-        reason = f"its {obstacles} bodies make a file that is too large to be read"
-        fix = "leave some out by --without MODEL, or split the world"
-        raise ConfigError(f"{file}: {reason}; {fix}.") from None
+        raise ConfigError(
+            f"{file}: its {obstacles} bodies make a file that is too large to be read; "
+            "leave some out by --without MODEL, or split the world."
+        ) from None
     world = validate(data, World, made)
     if world.map is None:
         world._file = made
         check_places(world)
+    return text
 
 
 @world.command()
 def draw(
     name: Shown,
-    out: Annotated[
-        Path | None, Option(help="File to write; by default <world>_drawn.png.")
-    ] = None,
+    out: Path | None = None,
     seed: console.SeedOption = 0,
     robot: console.RobotOption = DEFAULT_ROBOT,
-    footprint: Annotated[
-        float | None, Option(help="Radius of a round robot instead [m].")
-    ] = None,
+    footprint: float | None = None,
     as_json: console.JsonOption = False,
 ) -> None:
     """Draws the world of an episode, with start and goal.
 
     For a set, such as barn or a folder of files, it draws the world of the episode.
+
+    Args:
+        out: File to write; by default <world>_drawn.png.
+        seed: Seed of the episode.
+        robot: A shipped robot (see nics list robots) or a YAML file.
+        footprint: Radius of a round robot instead [m].
+
+    Examples:
+        nics world draw clutter --seed 3
     """
     with console.show_progress():
         from nics_drl_bridge.files import write_bytes
@@ -351,18 +322,25 @@ def _check_overwrite(worlds: Any, given: Path, *written: Path) -> None:
 @world.command("map")
 def map_(
     name: Shown,
-    out: Annotated[
-        Path | None, Option(help="File to write; by default <world>_map.yaml.")
-    ] = None,
+    out: Path | None = None,
     seed: console.SeedOption = 0,
     robot: console.RobotOption = DEFAULT_ROBOT,
-    resolution: Annotated[float, Option(help="Maximum side of a cell [m].")] = 0.01,
+    resolution: float = 0.01,
     as_json: console.JsonOption = False,
 ) -> None:
     """Writes the map of an episode for Nav2's map_server.
 
     Moving obstacles are omitted. `nics world map room`, then `ros2 run nav2_map_server
     map_server --ros-args -p yaml_filename:=room_map.yaml`.
+
+    Args:
+        out: File to write; by default <world>_map.yaml.
+        seed: Seed of the episode.
+        robot: A shipped robot (see nics list robots) or a YAML file.
+        resolution: Maximum side of a cell [m].
+
+    Examples:
+        nics world map room --out room_map.yaml
     """
     with console.show_progress():
         from nics_drl_bridge.lidar.maps import map_files

@@ -58,7 +58,8 @@ def account_for_arrival(
         return fresh, JUMPED
     if step <= 0.0:
         return arrivals, REPEATED
-    lead = _compute_lead(config, arrivals, stamp_ns, now)
+    first_ns, first_s = arrivals.origin
+    lead = (stamp_ns - first_ns) * S_PER_NS / config.clock_rate - (now - first_s)
     if lead - arrivals.envelope > (AHEAD_S if armed else config.clock_jump_s):
         return fresh, JUMPED
     marks = _append_mark(arrivals, stamp_ns, now, lead, config.settle_s)
@@ -81,13 +82,6 @@ def account_for_arrival(
         marks=marks,
     )
     return continued, ""
-
-
-def _compute_lead(
-    config: GateConfig, arrivals: Arrivals, stamp_ns: int, now: float
-) -> float:
-    first_ns, first_s = arrivals.origin
-    return (stamp_ns - first_ns) * S_PER_NS / config.clock_rate - (now - first_s)
 
 
 def _append_mark(

@@ -55,10 +55,8 @@ def format_entry(entry: Entry) -> bytes:
 
 
 def _format_record(record: dict[str, Any]) -> bytes:
-    return (
-        json.dumps({key: to_plain(part) for key, part in record.items()}).encode()
-        + b"\n"
-    )
+    plain = {key: to_plain(part) for key, part in record.items()}
+    return f"{json.dumps(plain)}\n".encode()
 
 
 class Replay(NamedTuple):
@@ -92,60 +90,38 @@ class Replay(NamedTuple):
         return [*lines, f"{spent}: {verdict}"]
 
 
-class _Step(NamedTuple):
-    """One line of a file."""
-
-    now: float
-    event: Input
-    decision: Decision
-    plain: Any  # the decision as it is in the file
-
-
 def replay(path: str | Path) -> Replay:
     """Repeats all decisions in a file. Raises ConfigError if it is not a complete black box."""
     head, *lines = _read_records(path)
-    try:
-        config, state, steps = _read_content(head, lines)
-    except (KeyError, RecursionError, TypeError, ValueError) as error:
-        raise _explain_damage(path, error) from None
     entries = []
     differing = []
-    for index, step in enumerate(steps):
-        entries.append(Entry(step.now, step.event, state, step.decision))
-        try:
-            state, replayed = decide(config, state, step.event, step.now)
-        except Exception as error:  # noqa: BLE001 - false records break the rules in any way
-            raise _explain_damage(path, error) from None
-        if json.dumps(to_plain(replayed)) != json.dumps(step.plain):
-            differing.append(index)
+    try:
+        if len(lines) > MOST_INPUTS:
+            fault = f"{len(lines)} inputs, where at most {MOST_INPUTS} are replayed"
+            raise ValueError(fault)
+        config = _read_kind(head["config"], GateConfig)
+        state = _read_kind(head["state"], GateState)
+        for index, line in enumerate(lines):
+            entry = _read_entry(line, state)
+            entries.append(entry)
+            state, replayed = decide(config, state, entry.given, entry.now)
+            if json.dumps(to_plain(replayed)) != json.dumps(line["decision"]):
+                differing.append(index)
+    except Exception as error:  # noqa: BLE001 - false records break the rules in any way
+        reason = shorten(str(error), 120)
+        raise ConfigError(
+            f"{path}: is damaged ({reason}); it can't be replayed."
+        ) from None
     return Replay(tuple(entries), tuple(differing))
 
 
-def _explain_damage(path: str | Path, error: Exception) -> ConfigError:
-    return ConfigError(
-        f"{path}: is damaged ({shorten(str(error), 120)}); it can't be replayed."
-    )
-
-
-def _read_content(
-    head: dict[str, Any], lines: list[dict[str, Any]]
-) -> tuple[GateConfig, GateState, list[_Step]]:
+def _read_entry(line: dict[str, Any], before: GateState) -> Entry:
     """Raises TypeError or ValueError for content that does not belong in a black box."""
-    if len(lines) > MOST_INPUTS:
-        raise ValueError(
-            f"{len(lines)} inputs, where at most {MOST_INPUTS} are replayed"
-        )
-    config = _read_kind(head["config"], GateConfig)
-    state = _read_kind(head["state"], GateState)
-    steps = []
-    for line in lines:
-        now = line["now"]
-        if not (isinstance(now, float | int) and abs(now) < LATEST_S):
-            raise ValueError("the time of an input is no time")
-        event = _read_kind(line["given"], *get_args(Input))
-        plain = line["decision"]
-        steps.append(_Step(now, event, _read_kind(plain, Decision), plain))
-    return config, state, steps
+    now = line["now"]
+    if not (isinstance(now, float | int) and abs(now) < LATEST_S):
+        raise ValueError("the time of an input is no time")
+    given = _read_kind(line["given"], *get_args(Input))
+    return Entry(now, given, before, _read_kind(line["decision"], Decision))
 
 
 def _read_kind(plain: Any, *kinds: type) -> Any:

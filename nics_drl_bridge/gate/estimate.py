@@ -7,7 +7,6 @@ recent estimate, or since arming, counts.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -31,21 +30,17 @@ REMEDY = (
 )
 
 
-class Growth(NamedTuple):
-    """Uncertainty of a pose relative to an earlier estimate, as standard deviations."""
+def compute_growth(mark: EstimateMark, estimate: Estimate) -> tuple[float, float]:
+    """Returns the uncertainty of an estimate's pose relative to an earlier one.
 
-    position: float  # [m]
-    heading: float  # [rad]
-
-
-def compute_growth(mark: EstimateMark, estimate: Estimate) -> Growth:
-    """Returns the uncertainty of an estimate's pose relative to an earlier one."""
+    It is the standard deviation of position [m] and heading [rad].
+    """
     # An old heading error shifts the pose at right angles to the path since then.
     x, y = (estimate.pose[:2] - mark.pose[:2]).tolist()
     carried = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
     gained = np.diag(estimate.covariance - carried @ mark.covariance @ carried.T)
     position = math.sqrt(max(0.0, float(gained[:2].max())))
-    return Growth(position, math.sqrt(max(0.0, float(gained[2]))))
+    return position, math.sqrt(max(0.0, float(gained[2])))
 
 
 def track_estimate(
@@ -58,7 +53,14 @@ def track_estimate(
     if state.estimate is None or not marks:  # nothing to compare it with
         return EstimateTrack((newest,), "", track.last_fault)
     fault = _find_jump(config, state.estimate, estimate, now - state.estimate_s)
-    fault = fault or _explain_uncertainty(config, marks[0], estimate, now)
+    position, heading = compute_growth(marks[0], estimate)
+    is_certain = position <= config.estimate_position
+    if not fault and not (is_certain and heading <= config.estimate_heading):
+        fault = (
+            f"it became uncertain by {position:.3g} m and {heading:.3g} rad in "
+            f"{now - marks[0].time_s:.1f} s, the limits are {config.estimate_position:g} m and "
+            f"{config.estimate_heading:g} rad"
+        )
     if fault:
         return EstimateTrack((newest,), fault, fault)
     if now - marks[-1].time_s >= ESTIMATE_MARK_S:
@@ -79,23 +81,6 @@ def _find_jump(
         return ""
     path, turn = moved
     return f"it jumped by {path:.3g} m and {turn:.3g} rad in {passed_s:.2f} s"
-
-
-def _explain_uncertainty(
-    config: GateConfig, origin: EstimateMark, estimate: Estimate, now: float
-) -> str:
-    """Returns the fault of an estimate that has become too uncertain, or ""."""
-    growth = compute_growth(origin, estimate)
-    if (
-        growth.position <= config.estimate_position
-        and growth.heading <= config.estimate_heading
-    ):
-        return ""
-    return (
-        f"it became uncertain by {growth.position:.3g} m and {growth.heading:.3g} rad in "
-        f"{now - origin.time_s:.1f} s, the limits are {config.estimate_position:g} m and "
-        f"{config.estimate_heading:g} rad"
-    )
 
 
 def restart_track(state: GateState) -> EstimateTrack:

@@ -117,18 +117,13 @@ def find_movers(
             shield.range_max,
             tolerance,
         )
-    return entered & _has_entered_neighbour(entered, lidar)
-
-
-def _has_entered_neighbour(entered: Flags, lidar: MountedBeams) -> Flags:
-    """Returns whether a neighbour of each beam (B,) is marked; a full circle wraps around."""
     before = np.roll(entered, 1)
     after = np.roll(entered, -1)
     is_full_circle = (len(entered) + 0.5) * abs(lidar.step) > FULL_CIRCLE
     if not is_full_circle:
         before[0] = False
         after[-1] = False
-    return before | after
+    return entered & (before | after)
 
 
 def estimate_motion(

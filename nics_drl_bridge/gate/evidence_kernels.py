@@ -135,20 +135,26 @@ def find_in_old_scan(
 
     Returns:
         distance: from the lidar at the old scan [m].
-        index: of the beam that points there, as if the beams covered the full circle; it may be
-            one full circle.
+        index: of the beam that points there, see `find_beam`.
     """
     angle = lidar.first + beam * lidar.step + lidar.heading
     x = lidar.x + length * math.cos(angle)
     y = lidar.y + length * math.sin(angle)
     cosine = math.cos(moved[2])
     sine = math.sin(moved[2])
-    dx = moved[0] + cosine * x - sine * y - lidar.x
-    dy = moved[1] + sine * x + cosine * y - lidar.y
+    old_x = moved[0] + cosine * x - sine * y
+    old_y = moved[1] + sine * x + cosine * y
+    distance = math.hypot(old_x - lidar.x, old_y - lidar.y)
+    return distance, find_beam(old_x, old_y, lidar)
+
+
+@kernel
+def find_beam(x: float, y: float, lidar: MountedBeams) -> int:
+    """Returns the index of the beam towards a point, as if the beams covered the full circle."""
     circle = 2.0 * math.pi / abs(lidar.step)  # in beams
-    bearing = (math.atan2(dy, dx) - lidar.heading - lidar.first) / lidar.step
-    index = round(bearing - circle * math.floor(bearing / circle))
-    return math.hypot(dx, dy), index
+    angle = math.atan2(y - lidar.y, x - lidar.x)
+    bearing = (angle - lidar.heading - lidar.first) / lidar.step
+    return math.floor(bearing - circle * math.floor((bearing + 0.5) / circle) + 0.5)
 
 
 @kernel

@@ -6,7 +6,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.gate.scan_motion import SETTINGS, make_directions
+from nics_drl_bridge.gate.scan_motion import make_directions
 from nics_drl_bridge.gate.scan_motion_kernels import predict_scan
 from nics_drl_bridge.gate.state import (
     GateConfig,
@@ -159,7 +159,7 @@ def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> Flags:
     must_change = np.isfinite(ranges)
     for error in HEADING_ERRORS:
         turned = moved + np.array([0.0, 0.0, error])
-        predict_scan(ends, directions, turned, SETTINGS.gap, predicted)
+        predict_scan(ends, directions, turned, predicted)
         # Both are False where the old scan does not show what comes (NaN).
         nearer = ranges < predicted - CHANGE
         farther = (ranges > predicted + CHANGE) & (predicted < nearest_open)

@@ -21,7 +21,7 @@ from nics_drl_bridge.gate.evidence_kernels import MountedBeams
 from nics_drl_bridge.gate.footprint import get_body
 from nics_drl_bridge.gate.ground_kernels import Grid
 from nics_drl_bridge.gate.shield_kernels import Body
-from nics_drl_bridge.gate.state import GateConfig, Ground, Ranges, ShieldConfig, View
+from nics_drl_bridge.gate.state import GateConfig, Ground, Ranges, View
 from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.sim.collision_kernels import Outline
 
@@ -43,17 +43,13 @@ def update_ground(
     Without earlier ground, the area around the robot is assumed to be free.
     """
     shield = config.shield
-    if shield is None or not views or _looks_all_around(config, shield):
+    if shield is None or not views:
         return None
-    return observe_ground(
-        before, views[-1], get_beams(config), get_body(shield), shield.range_max
-    )
-
-
-def _looks_all_around(config: GateConfig, shield: ShieldConfig) -> bool:
-    """True if the angle without beams is too small to count as unknown."""
-    blind_angle = 2.0 * np.pi - abs(get_beams(config).step) * len(config.beam_angles)
-    return bool(blind_angle < shield.unknown_share * shield.unknown_width)
+    lidar = get_beams(config)
+    blind_angle = 2.0 * np.pi - abs(lidar.step) * len(config.beam_angles)
+    if blind_angle < shield.unknown_share * shield.unknown_width:
+        return None  # too little to count as unknown
+    return observe_ground(before, views[-1], lidar, get_body(shield), shield.range_max)
 
 
 def observe_ground(

@@ -11,7 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.gate.evidence_kernels import MountedBeams, take_shorter
+from nics_drl_bridge.gate.evidence_kernels import (
+    MountedBeams,
+    find_beam,
+    take_shorter,
+)
 from nics_drl_bridge.gate.shield_kernels import Body, compute_clearance
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.kernels import kernel
@@ -107,7 +111,7 @@ def _find_view(
     dx = x - lidar.x
     dy = y - lidar.y
     distance = max(math.sqrt(dx * dx + dy * dy), width)
-    middle = _find_beam(x, y, lidar)
+    middle = find_beam(x, y, lidar)
     half_width = math.ceil(0.5 * width / (distance * abs(lidar.step)))
     return distance, middle - half_width, middle + half_width
 
@@ -179,12 +183,3 @@ def _locate_cell(i: int, j: int, grid: Grid) -> tuple[float, float]:
     dx = grid.x + (j + 0.5) * grid.width
     dy = grid.y + (i + 0.5) * grid.width
     return grid.cosine * dx + grid.sine * dy, grid.cosine * dy - grid.sine * dx
-
-
-@kernel
-def _find_beam(x: float, y: float, lidar: MountedBeams) -> int:
-    """Returns the index of the beam towards a point, out of range if there is none."""
-    circle = 2.0 * math.pi / abs(lidar.step)  # in beams
-    angle = math.atan2(y - lidar.y, x - lidar.x)
-    bearing = (angle - lidar.heading - lidar.first) / lidar.step
-    return math.floor(bearing - circle * math.floor((bearing + 0.5) / circle) + 0.5)

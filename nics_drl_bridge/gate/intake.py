@@ -46,11 +46,16 @@ def take(
     config: GateConfig, state: GateState, event: inputs.Input, now: float
 ) -> Taken:
     """Adds an input at a steady time [s] to the state, or returns the reason for a refusal."""
-    state = _clear_faults(state)
+    state = replace(state, jumped="", leap="", mixed="")
+    if state.estimates.fault:
+        state = replace(state, estimates=replace(state.estimates, fault=""))
     if isinstance(event, inputs.Command):
         state = stops.watch_source(state, event, now)
-    reason = _find_refusal(config, event)
-    if reason:
+    for kind, judge in REFUSALS:
+        reason = judge(config, event) if isinstance(event, kind) else ""
+        if not reason:
+            continue
+        reason = f"{inputs.get_topic(event)}: {reason}"
         if isinstance(event, inputs.Command):
             # An earlier command that waits for its scan must no longer take effect.
             state = replace(state, malformed=reason, pending=None, pending_s=None)
@@ -78,23 +83,6 @@ def take(
         stop = replace(state.e_stop, latched=True, reason=event.reason)
         state = replace(state, e_stop=stop)
     return state, ""
-
-
-def _clear_faults(state: GateState) -> GateState:
-    """Returns the state without the faults of the previous input."""
-    state = replace(state, jumped="", leap="", mixed="")
-    if not state.estimates.fault:
-        return state
-    return replace(state, estimates=replace(state.estimates, fault=""))
-
-
-def _find_refusal(config: GateConfig, event: inputs.Input) -> str:
-    """Returns the topic of an input and the first reason to refuse it, or ""."""
-    for kind, judge in REFUSALS:
-        reason = judge(config, event) if isinstance(event, kind) else ""
-        if reason:
-            return f"{inputs.get_topic(event)}: {reason}"
-    return ""
 
 
 def _take_command(

@@ -24,13 +24,13 @@ import numpy as np
 
 from nics_drl_bridge.gate import scan_motion_kernels as kernels
 from nics_drl_bridge.gate.inputs import Odometry, Scan
-from nics_drl_bridge.gate.scan_motion_kernels import Directions, Noise, Thresholds
+from nics_drl_bridge.gate.scan_motion_kernels import Directions, Noise
 from nics_drl_bridge.gate.state import (
     GateConfig,
     GateState,
     Ranges,
-    ReducedScan,
     ScanMotion,
+    View,
     replace,
 )
 from nics_drl_bridge.geometry import between, compose, exp
@@ -73,11 +73,6 @@ class Settings:
             minimum motion: noise would hide a smaller one.
         usual_turn: a younger reference is preferred if the robot turned further than this [rad].
         max_turn: no reference is used if it turned further: a room may repeat itself [rad].
-        min_change: root mean square of the predicted changes of a sector that is compared [m].
-        min_deviations: the same, in standard deviations of the lidar's noise.
-        visible_change: change of a range that is more than noise [m].
-        visible_deviations: the same, in standard deviations of the lidar's noise.
-        gap: neighbours are on two surfaces if their ranges differ by more than this fraction.
         min_sectors: minimum number of compared sectors.
         min_contradicting: minimum fraction of them that show less than `sector_share`.
         sector_share: magnitude of a share below which a sector contradicts odometry.
@@ -102,11 +97,6 @@ class Settings:
     min_half_motion: float = 0.5
     usual_turn: float = 0.6
     max_turn: float = 1.4
-    min_change: float = 0.03
-    min_deviations: float = 1.8
-    visible_change: float = 0.05
-    visible_deviations: float = 3.0
-    gap: float = 0.25
     min_sectors: int = 5
     min_contradicting: float = 0.6
     sector_share: float = 0.45
@@ -130,7 +120,7 @@ class Verdict(NamedTuple):
 
     share: float
     held: bool
-    reference: ReducedScan | None = None
+    reference: View | None = None
 
 
 UNDECIDED = Verdict(math.nan, False)
@@ -139,9 +129,10 @@ UNDECIDED = Verdict(math.nan, False)
 def watch_scan(config: GateConfig, state: GateState, scan: Scan) -> ScanMotion:
     """Returns what recent scans show of the motion, after a new scan."""
     before = state.scan_motion
-    if not _can_judge(config) or state.odometry is None:
+    is_judged = config.stop_when_held and len(config.beam_angles) >= 2
+    if not is_judged or state.odometry is None:
         return ScanMotion()
-    newest = ReducedScan(
+    newest = View(
         scan.stamp_ns,
         extrapolate_pose(state.odometry, scan.stamp_ns, SETTINGS.longest_s),
         _reduce_scan(config, scan.ranges),
@@ -180,11 +171,6 @@ def extrapolate_pose(odometry: Odometry, stamp_ns: int, longest_s: float) -> Arr
     return compose(odometry.pose, exp(seconds * odometry.twist))
 
 
-def _can_judge(config: GateConfig) -> bool:
-    """True if the rule is on, and the lidar has at least two beams."""
-    return config.stop_when_held and len(config.beam_angles) >= 2
-
-
 def _compute_memory_s(config: GateConfig) -> float:
     """Returns how long scans are kept [s], which is longer for a slow lidar."""
     slow_s = min(
@@ -208,7 +194,7 @@ def _update_held_since(
 
 
 def _explain_contradiction(
-    newest: ReducedScan, verdict: Verdict, held_since_ns: int | None
+    newest: View, verdict: Verdict, held_since_ns: int | None
 ) -> str:
     """Returns a sentence once scans have contradicted odometry for long enough, else nothing."""
     reference = verdict.reference
@@ -223,9 +209,7 @@ def _explain_contradiction(
     return f"odometry shows {motion}, {fault}"
 
 
-def judge_motion(
-    config: GateConfig, kept: tuple[ReducedScan, ...], newest: ReducedScan
-) -> Verdict:
+def judge_motion(config: GateConfig, kept: tuple[View, ...], newest: View) -> Verdict:
     """Judges whether the newest scan shows the motion that odometry shows since an earlier one."""
     reference, lesser_fraction = _select_reference(kept, newest)
     if reference is None:
@@ -250,7 +234,7 @@ def judge_motion(
 
 
 def _compare_scans(
-    config: GateConfig, reference: ReducedScan, newest: ReducedScan
+    config: GateConfig, reference: View, newest: View
 ) -> tuple[Array, Array]:
     """Returns, per sector, what the newest scan shows of the motion since the reference.
 
@@ -259,28 +243,26 @@ def _compare_scans(
     mount = np.array(config.mount)
     moved = between(compose(reference.pose, mount), compose(newest.pose, mount))
     directions = get_directions(config)
+    # The change of a range is the difference of two medians, each of n ranges with normal noise:
+    # its standard deviation is sqrt(2) * sqrt(pi / 2) / sqrt(n) times theirs, and at most sqrt(2)
+    # times.
+    count = 2 * directions.half_window + 1
+    factor = math.sqrt(2.0) * min(1.0, MEDIAN_FACTOR / math.sqrt(count))
     predicted = np.empty_like(reference.ranges)
-    kernels.predict_scan(reference.ranges, directions, moved, SETTINGS.gap, predicted)
-    thresholds = Thresholds(
-        SETTINGS.min_change,
-        SETTINGS.min_deviations,
-        SETTINGS.visible_change,
-        SETTINGS.visible_deviations,
-    )
+    kernels.predict_scan(reference.ranges, directions, moved, predicted)
     compared: tuple[Array, Array] = kernels.compare_sectors(
         reference.ranges,
         newest.ranges,
         predicted,
         round(SETTINGS.sector / directions.step) or 1,
-        compute_noise(config, directions),
-        thresholds,
+        Noise(*(factor * std for std in config.range_noise)),
     )
     return compared
 
 
 def _select_reference(
-    kept: tuple[ReducedScan, ...], newest: ReducedScan
-) -> tuple[ReducedScan | None, float]:
+    kept: tuple[View, ...], newest: View
+) -> tuple[View | None, float]:
     """Returns the scan to compare the newest one with; None if odometry shows too little motion.
 
     Also returns the fraction of the motion in the half of the time with less motion.
@@ -316,14 +298,14 @@ def _select_reference(
     return reference, lesser_motion / motion
 
 
-def _measure_motion(old: ReducedScan, new: ReducedScan) -> float:
+def _measure_motion(old: View, new: View) -> float:
     """Returns the motion that odometry shows between two scans, in multiples of the minimum."""
     path = math.hypot(*(new.pose[:2] - old.pose[:2]).tolist())
     turn = abs(_measure_turn(old, new))
     return max(path / SETTINGS.min_path, turn / SETTINGS.min_turn)
 
 
-def _measure_turn(old: ReducedScan, new: ReducedScan) -> float:
+def _measure_turn(old: View, new: View) -> float:
     """Returns the turn that odometry shows between two scans, of at most half a circle."""
     return math.remainder(float(new.pose[2] - old.pose[2]), FULL_CIRCLE)
 
@@ -364,24 +346,12 @@ def make_directions(config: GateConfig, size: int, half_window: int) -> Directio
     )
 
 
-def compute_noise(config: GateConfig, directions: Directions) -> Noise:
-    """Returns the standard deviation of the change of a reduced range.
-
-    The change is the difference of two medians, each of n ranges with normal noise: its standard
-    deviation is sqrt(2) * sqrt(pi / 2) / sqrt(n) times theirs, and at most sqrt(2) times.
-    """
-    count = 2 * directions.half_window + 1
-    factor = math.sqrt(2.0) * min(1.0, MEDIAN_FACTOR / math.sqrt(count))
-    constant, proportional = config.range_noise
-    return Noise(factor * constant, factor * proportional)
-
-
 def warm_up(config: GateConfig) -> None:
     """Compiles the kernels for a scan, which takes seconds that a moving robot does not have."""
     if len(config.beam_angles) < 2:
         return
     ranges = np.ones(len(config.beam_angles), np.float32)
-    view = ReducedScan(0, np.zeros(3), _reduce_scan(config, ranges))
+    view = View(0, np.zeros(3), _reduce_scan(config, ranges))
     views = tuple(
         replace(view, stamp_ns=k, pose=np.array([0.1 * k, 0.0, 0.0])) for k in range(3)
     )

@@ -22,6 +22,15 @@ Point = tuple[float, float]  # x, y [m]
 # Maximum number of beams in a window. For a denser lidar, only the middle ones are
 # used.
 LARGEST_WINDOW = 129
+# Neighbours are on two surfaces if their ranges differ by more than this fraction of the shorter.
+GAP = 0.25
+# Root mean square of the predicted changes of a sector that is compared: the larger of a length
+# [m] and a number of standard deviations of the noise.
+MIN_CHANGE = 0.03
+MIN_DEVIATIONS = 1.8
+# The same for a change of a range that is more than noise.
+VISIBLE_CHANGE = 0.05
+VISIBLE_DEVIATIONS = 3.0
 
 
 class Directions(NamedTuple):
@@ -49,22 +58,6 @@ class Noise(NamedTuple):
 
     constant: float  # [m]
     proportional: float
-
-
-class Thresholds(NamedTuple):
-    """Minimum changes of a range: the larger of a length and a number of deviations.
-
-    Attributes:
-        predicted: change that the motion must cause in a sector that is compared [m].
-        predicted_deviations: the same in standard deviations.
-        visible: observed change that exceeds noise [m].
-        visible_deviations: the same in standard deviations.
-    """
-
-    predicted: float
-    predicted_deviations: float
-    visible: float
-    visible_deviations: float
 
 
 @kernel(allocates=True)
@@ -102,7 +95,7 @@ def reduce_scan(ranges: Ranges, directions: Directions, out: Ranges) -> None:
 
 @kernel
 def predict_scan(
-    ranges: Ranges, directions: Directions, moved: Array, gap: float, out: Ranges
+    ranges: Ranges, directions: Directions, moved: Array, out: Ranges
 ) -> None:
     """Writes the ranges (K,) of a lidar after a motion, from the surfaces it saw before.
 
@@ -114,8 +107,6 @@ def predict_scan(
         ranges: (K,) of the old scan [m].
         directions: of both scans.
         moved: (3,) motion of the lidar in its old frame: x, y [m], heading [rad].
-        gap: maximum difference of neighbouring ranges on one surface, as a fraction of
-            the shorter one.
         out: (K,) ranges to the nearest surface [m]; NaN in directions that none covers.
     """
     count = ranges.shape[0]
@@ -126,7 +117,7 @@ def predict_scan(
     for k in range(pairs):
         range_a = ranges[k]
         range_b = ranges[(k + 1) % count]
-        if abs(range_a - range_b) <= gap * min(range_a, range_b):
+        if abs(range_a - range_b) <= GAP * min(range_a, range_b):
             bearing = directions.first + k * directions.step
             a = _move_point(range_a, bearing, moved)
             b = _move_point(range_b, bearing + directions.step, moved)
@@ -169,12 +160,7 @@ def _draw_surface(out: Ranges, a: Point, b: Point, directions: Directions) -> No
 
 @kernel(allocates=True)
 def compare_sectors(
-    old: Ranges,
-    new: Ranges,
-    predicted: Ranges,
-    sector: int,
-    noise: Noise,
-    thresholds: Thresholds,
+    old: Ranges, new: Ranges, predicted: Ranges, sector: int, noise: Noise
 ) -> tuple[Array, Array]:
     """Compares the observed changes of ranges with the predicted ones, sector by sector.
 
@@ -187,7 +173,6 @@ def compare_sectors(
         predicted: ranges (K,) that the motion in between predicts for the new one [m].
         sector: number of directions in a sector.
         noise: of the ranges.
-        thresholds: of the changes.
 
     Returns:
         observed: fraction of the predicted change that was observed (S,), by least squares, with
@@ -201,14 +186,14 @@ def compare_sectors(
         begin = index * sector
         end = min(begin + sector, count)
         observed[index], changed[index] = _compare_sector(
-            old[begin:end], new[begin:end], predicted[begin:end], noise, thresholds
+            old[begin:end], new[begin:end], predicted[begin:end], noise
         )
     return observed, changed
 
 
 @kernel
 def _compare_sector(
-    old: Ranges, new: Ranges, predicted: Ranges, noise: Noise, thresholds: Thresholds
+    old: Ranges, new: Ranges, predicted: Ranges, noise: Noise
 ) -> tuple[float, float]:
     """Returns the observed and the changed fraction of one sector; NaN and 0 if undecided."""
     compared = 0
@@ -222,10 +207,8 @@ def _compare_sector(
         if not (math.isfinite(predicted_change) and math.isfinite(observed_change)):
             continue
         std = noise.constant + noise.proportional * old[k]
-        needed = max(thresholds.predicted, thresholds.predicted_deviations * std)
-        if abs(observed_change) > max(
-            thresholds.visible, thresholds.visible_deviations * std
-        ):
+        needed = max(MIN_CHANGE, MIN_DEVIATIONS * std)
+        if abs(observed_change) > max(VISIBLE_CHANGE, VISIBLE_DEVIATIONS * std):
             visible += 1
         limit = 2.0 * abs(predicted_change)
         compared += 1

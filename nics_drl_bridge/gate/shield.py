@@ -29,7 +29,7 @@ from nics_drl_bridge.gate.evidence import make_static
 from nics_drl_bridge.gate.evidence_kernels import MountedBeams, Tolerance
 from nics_drl_bridge.gate.footprint import get_body
 from nics_drl_bridge.gate.limits import Limits
-from nics_drl_bridge.gate.shield_kernels import Body
+from nics_drl_bridge.gate.shield_kernels import Stop
 from nics_drl_bridge.gate.state import (
     GateConfig,
     GateState,
@@ -56,14 +56,6 @@ TURN_RATE_COUNT = 9
 CURVATURE_COUNT = 18
 # Above this speed [m/s] the curvature of a car is computed from its odometry.
 CURVATURE_SPEED = 0.1
-
-
-class Stop(NamedTuple):
-    """A stop to be swept: the robot keeps its twist for a reaction time, then brakes."""
-
-    body: Body
-    reaction_s: float
-    deceleration: float  # [m/s^2]
 
 
 class Threat(NamedTuple):
@@ -211,7 +203,7 @@ def _is_free(
     commands = np.array([*threat.commands, value])
     twists = _span_twists(config, shield, commands, threat.odometry)
     return all(
-        shield_kernels.is_free(threat.obstacles, twists, *stop, STEP)
+        shield_kernels.is_free(threat.obstacles, twists, stop, STEP)
         for stop in threat.stops
     )
 
@@ -265,7 +257,7 @@ def list_stops(
     deceleration = braking * shield.deceleration
     turn = shield.turn
     if turn is None:
-        return [Stop(body, reaction_s, deceleration)]
+        return [Stop(body, 0.0, 0.0, reaction_s, deceleration)]
     # Fractions of the bounds on path and turn by which the robot moves.
     fractions = [(1.0, 1.0)]
     if turn.least_turn < SHORT_STOP:
@@ -281,11 +273,15 @@ def list_stops(
         turn_reaction_s = (
             reaction_s - latencies * shield.latency_s + turn_latencies * turn.reaction_s
         )
-        turning_body = body._replace(
-            turn_delay=turn_reaction_s - path_reaction_s,
-            turn_deceleration=braking * turn.deceleration / turn_fraction,
+        stops.append(
+            Stop(
+                body,
+                turn_reaction_s - path_reaction_s,
+                braking * turn.deceleration / turn_fraction,
+                path_reaction_s,
+                deceleration / path_fraction,
+            )
         )
-        stops.append(Stop(turning_body, path_reaction_s, deceleration / path_fraction))
     return stops
 
 
@@ -333,11 +329,10 @@ def _span_car_twists(
         speeds.append(odometry[0])
         if abs(odometry[0]) > CURVATURE_SPEED:
             curvatures.append(odometry[2] / odometry[0])
-    low = min(curvatures)
-    high = max(curvatures)
-    count = CURVATURE_COUNT if high > low else 1
+    # none twice if the car drives straight
+    spanned = np.unique(np.linspace(min(curvatures), max(curvatures), CURVATURE_COUNT))
     extremes = [speed for speed in sorted({max(speeds), min(speeds)}) if speed != 0.0]
-    speed, curvature = np.meshgrid(extremes, np.linspace(low, high, count))
+    speed, curvature = np.meshgrid(extremes, spanned)
     twists = np.stack([speed, np.zeros_like(speed), speed * curvature], axis=-1)
     return twists.reshape(-1, 3)
 
@@ -348,7 +343,8 @@ def warm_up() -> None:
     body = get_body(
         ShieldConfig(0.0, 1.0, 0.0, 0.0, footprint_radius=1.0, obstacle_speed=0.0)
     )
-    shield_kernels.is_free(np.zeros((1, 3)), np.zeros((1, 3)), body, 0.0, 1.0, STEP)
+    stop = Stop(body, 0.0, 0.0, 0.0, 1.0)
+    shield_kernels.is_free(np.zeros((1, 3)), np.zeros((1, 3)), stop, STEP)
     lidar = MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0)
     ranges = np.ones(1, np.float32)
     tolerance = Tolerance(0.0, 0.0)

@@ -17,8 +17,6 @@ Shared arguments:
     twist (3,): of the robot before it stops: vx, vy [m/s], turn rate [rad/s].
     braked_speed: the one that is braked [m/s], as `_bound_path` returns it; `speed` is that of the
         origin.
-    reaction: time from now until the speed is braked [s].
-    deceleration: of the speed [m/s^2].
 """
 
 import math
@@ -60,9 +58,6 @@ class Body(NamedTuple):
         margin: clearance [m].
         lever: factor of the turn rate in the speed that is braked [m].
         order: of the norm of vx and vy that is braked; see `robot.braking.Braking`.
-        turn_delay: time by which a turn begins to brake later than the speed [s].
-        turn_deceleration: of a turn that brakes independently of the speed [rad/s^2]; 0
-            if it does not.
     """
 
     outline: Outline
@@ -71,19 +66,29 @@ class Body(NamedTuple):
     margin: float
     lever: float
     order: float
-    turn_delay: float = 0.0
-    turn_deceleration: float = 0.0
+
+
+class Stop(NamedTuple):
+    """A stop to be swept: the robot keeps its twist for a reaction time, then brakes.
+
+    Attributes:
+        body: the footprint, and its margin.
+        turn_delay: time by which a turn begins to brake later than the speed [s].
+        turn_deceleration: of a turn that brakes independently of the speed [rad/s^2]; 0
+            if it does not.
+        reaction: time from now until the speed is braked [s].
+        deceleration: of the speed [m/s^2].
+    """
+
+    body: Body
+    turn_delay: float
+    turn_deceleration: float
+    reaction: float
+    deceleration: float
 
 
 @kernel(allocates=True)
-def is_free(
-    obstacles: Array,
-    twists: Array,
-    body: Body,
-    reaction: float,
-    deceleration: float,
-    step: float,
-) -> bool:
+def is_free(obstacles: Array, twists: Array, stop: Stop, step: float) -> bool:
     """True if a robot keeps its margin from all obstacles while it stops from any of the twists.
 
     An obstacle that is already within the margin must not come nearer.
@@ -91,71 +96,50 @@ def is_free(
     Args:
         obstacles: (P, 3), see the columns above.
         twists: (K, 3) from which the robot may stop.
-        body: the footprint, and its margin.
-        reaction: time until the speed is braked [s].
-        deceleration: of the speed [m/s^2].
+        stop: how it stops.
         step: maximum path of the footprint between two places [m].
     """
-    longest_path, longest_time = _bound_stops(twists, body, reaction, deceleration)
-    near = _select_near(obstacles, body, longest_path, longest_time)
+    longest_path = 0.0
+    longest_time = 0.0
+    for k in range(twists.shape[0]):
+        path, braked_speed = _bound_path(twists[k], stop)
+        longest_path = max(longest_path, path)
+        rest_time = _compute_rest_time(twists[k], braked_speed, stop)
+        longest_time = max(longest_time, rest_time)
+    near = _select_near(obstacles, stop.body, longest_path, longest_time)
     if near.shape[0] == 0:
         return True
     places = np.empty((math.ceil(longest_path / step) + 1, 5))
-    for k in range(twists.shape[0]):
-        if not _is_stop_free(
-            near, places, twists[k], body, reaction, deceleration, step
-        ):
+    for k in range(twists.shape[0]):  # noqa: SIM110 - kernels have no generators
+        if not _is_stop_free(near, places, twists[k], stop, step):
             return False
     return True
 
 
-@kernel
-def _bound_stops(
-    twists: Array, body: Body, reaction: float, deceleration: float
-) -> tuple[float, float]:
-    """Returns the longest path [m] and time [s] of the stops from all twists (K, 3)."""
-    longest_path = 0.0
-    longest_time = 0.0
-    for k in range(twists.shape[0]):
-        path, braked_speed = _bound_path(twists[k], body, reaction, deceleration)
-        rest_time = _compute_rest_time(
-            twists[k], braked_speed, body, reaction, deceleration
-        )
-        longest_path = max(longest_path, path)
-        longest_time = max(longest_time, rest_time)
-    return longest_path, longest_time
-
-
 @kernel(allocates=True)
 def _is_stop_free(
-    near: Array,
-    all_places: Array,
-    twist: Array,
-    body: Body,
-    reaction: float,
-    deceleration: float,
-    step: float,
+    near: Array, all_places: Array, twist: Array, stop: Stop, step: float
 ) -> bool:
     """True if a robot keeps its clearance from near obstacles (Q, 5) while it stops from a twist.
 
     `all_places` has room for the places of the stop.
     """
-    path, braked_speed = _bound_path(twist, body, reaction, deceleration)
+    path, braked_speed = _bound_path(twist, stop)
     steps = math.ceil(path / step)
     if steps == 0:
         return True
     places = all_places[: steps + 1]
-    duration = reaction + braked_speed / (2.0 * deceleration)
+    duration = stop.reaction + braked_speed / (2.0 * stop.deceleration)
     step_time = duration / steps
     # Braking makes the last step longest: it moves by braked_speed * step_time, and ends at rest.
     longest_step_time = step_time + math.sqrt(
-        2.0 * braked_speed * step_time / deceleration
+        2.0 * braked_speed * step_time / stop.deceleration
     )
     is_filled = False
-    if body.turn_deceleration > 0.0:
+    if stop.turn_deceleration > 0.0:
         is_filled = True
         longest_step_time = _fill_places_of_separate_turn(
-            places, path, twist, braked_speed, body, reaction, deceleration
+            places, path, twist, braked_speed, stop
         )
     for p in range(near.shape[0]):
         loss_per_step = path / steps + near[p, APPROACH] * longest_step_time
@@ -163,9 +147,9 @@ def _is_stop_free(
         s = _count_safe_steps(spare, loss_per_step, steps)
         if s <= steps and not is_filled:
             is_filled = True
-            _fill_places(places, duration, twist, braked_speed, reaction, deceleration)
+            _fill_places(places, duration, twist, braked_speed, stop)
         while s <= steps:
-            spare = _measure_spare(near, p, places, s, body)
+            spare = _measure_spare(near, p, places, s, stop.body)
             if spare < 0.0:
                 return False
             s += _count_safe_steps(spare, loss_per_step, steps)
@@ -187,44 +171,36 @@ def _measure_spare(near: Array, p: int, places: Array, s: int, body: Body) -> fl
 
 
 @kernel
-def _bound_path(
-    twist: Array, body: Body, reaction: float, deceleration: float
-) -> tuple[float, float]:
+def _bound_path(twist: Array, stop: Stop) -> tuple[float, float]:
     """Returns the longest path of a point of the footprint [m], and the speed that brakes [m/s].
 
     A turn brakes like the speed of the point that it moves most, unless it brakes
     independently.
     """
     speed = math.hypot(twist[0], twist[1])
-    turn_speed = abs(twist[2]) * body.farthest_corner
+    turn_speed = abs(twist[2]) * stop.body.farthest_corner
     braked_speed = speed
-    if body.order == 1.0:
+    if stop.body.order == 1.0:
         braked_speed = abs(twist[0]) + abs(twist[1])
-    elif body.order == math.inf:
+    elif stop.body.order == math.inf:
         braked_speed = max(abs(twist[0]), abs(twist[1]))
-    if body.turn_deceleration > 0.0:
-        turn_reaction = reaction + body.turn_delay
-        turn_time = turn_reaction + abs(twist[2]) / (2.0 * body.turn_deceleration)
-        path = speed * (reaction + braked_speed / (2.0 * deceleration))
+    if stop.turn_deceleration > 0.0:
+        turn_reaction = stop.reaction + stop.turn_delay
+        turn_time = turn_reaction + abs(twist[2]) / (2.0 * stop.turn_deceleration)
+        path = speed * (stop.reaction + braked_speed / (2.0 * stop.deceleration))
         return path + turn_speed * turn_time, braked_speed
-    braked_speed = max(braked_speed + abs(twist[2]) * body.lever, turn_speed)
-    duration = reaction + braked_speed / (2.0 * deceleration)
+    braked_speed = max(braked_speed + abs(twist[2]) * stop.body.lever, turn_speed)
+    duration = stop.reaction + braked_speed / (2.0 * stop.deceleration)
     return (speed + turn_speed) * duration, braked_speed
 
 
 @kernel
-def _compute_rest_time(
-    twist: Array,
-    braked_speed: float,
-    body: Body,
-    reaction: float,
-    deceleration: float,
-) -> float:
+def _compute_rest_time(twist: Array, braked_speed: float, stop: Stop) -> float:
     """Returns the time until a braking robot rests [s]."""
-    rest_time = reaction + braked_speed / deceleration
-    if body.turn_deceleration > 0.0:
-        turn_time = abs(twist[2]) / body.turn_deceleration
-        rest_time = max(rest_time, reaction + body.turn_delay + turn_time)
+    rest_time = stop.reaction + braked_speed / stop.deceleration
+    if stop.turn_deceleration > 0.0:
+        turn_time = abs(twist[2]) / stop.turn_deceleration
+        rest_time = max(rest_time, stop.reaction + stop.turn_delay + turn_time)
     return rest_time
 
 
@@ -268,12 +244,7 @@ def compute_clearance(x: float, y: float, body: Body) -> float:
 
 @kernel(allocates=True)
 def _fill_places(
-    places: Array,
-    duration: float,
-    twist: Array,
-    braked_speed: float,
-    reaction: float,
-    deceleration: float,
+    places: Array, duration: float, twist: Array, braked_speed: float, stop: Stop
 ) -> None:
     """Fills places (S + 1, 5) evenly along an arc that takes a duration [s] at full speed."""
     steps = len(places) - 1
@@ -284,20 +255,12 @@ def _fill_places(
         places[s, Y] = y
         places[s, COSINE] = cosine
         places[s, SINE] = sine
-        places[s, TIME] = _compute_braking_time(
-            full_speed_time, braked_speed, reaction, deceleration
-        )
+        places[s, TIME] = _compute_braking_time(full_speed_time, braked_speed, stop)
 
 
 @kernel(allocates=True)
 def _fill_places_of_separate_turn(
-    places: Array,
-    path: float,
-    twist: Array,
-    braked_speed: float,
-    body: Body,
-    reaction: float,
-    deceleration: float,
+    places: Array, path: float, twist: Array, braked_speed: float, stop: Stop
 ) -> float:
     """Fills places for a turn that brakes independently; returns the longest step [s].
 
@@ -305,36 +268,28 @@ def _fill_places_of_separate_turn(
     `_fill_places`. Such a robot leaves its arc, so each place is reached from the
     previous one by a separate arc.
     """
-    rest_time = _compute_rest_time(twist, braked_speed, body, reaction, deceleration)
+    rest_time = _compute_rest_time(twist, braked_speed, stop)
     steps = len(places) - 1
     places[0] = 0.0
     places[0, COSINE] = 1.0
-    time = 0.0
     drive_time = 0.0
     turn_time = 0.0
     longest_step = 0.0
     for s in range(1, steps + 1):
+        time = places[s - 1, TIME]
         next_time = rest_time
         if s < steps:
             next_time = _find_time(
-                path * s / steps,
-                time,
-                rest_time,
-                twist,
-                braked_speed,
-                body,
-                reaction,
-                deceleration,
+                path * s / steps, time, rest_time, twist, braked_speed, stop
             )
         next_drive_time, next_turn_time = _split_time(
-            next_time, twist, braked_speed, body, reaction, deceleration
+            next_time, twist, braked_speed, stop
         )
         drive = next_drive_time - drive_time
         turn = next_turn_time - turn_time
         _append_place(places, s, (twist[0] * drive, twist[1] * drive, twist[2] * turn))
         places[s, TIME] = next_time
         longest_step = max(longest_step, next_time - time)
-        time = next_time
         drive_time = next_drive_time
         turn_time = next_turn_time
     return longest_step
@@ -342,17 +297,15 @@ def _fill_places_of_separate_turn(
 
 @kernel
 def _split_time(
-    time: float,
-    twist: Array,
-    braked_speed: float,
-    body: Body,
-    reaction: float,
-    deceleration: float,
+    time: float, twist: Array, braked_speed: float, stop: Stop
 ) -> tuple[float, float]:
     """Returns the times at full speed and full turn rate that move a braking robot as far [s]."""
-    drive_time = _compute_full_speed_time(time, braked_speed, reaction, deceleration)
+    drive_time = _compute_full_speed_time(
+        time, braked_speed, stop.reaction, stop.deceleration
+    )
+    turn_reaction = stop.reaction + stop.turn_delay
     turn_time = _compute_full_speed_time(
-        time, abs(twist[2]), reaction + body.turn_delay, body.turn_deceleration
+        time, abs(twist[2]), turn_reaction, stop.turn_deceleration
     )
     return drive_time, turn_time
 
@@ -364,18 +317,14 @@ def _find_time(
     high: float,
     twist: Array,
     braked_speed: float,
-    body: Body,
-    reaction: float,
-    deceleration: float,
+    stop: Stop,
 ) -> float:
     """Returns the time, within [low, high], at which the footprint has moved so far [m]."""
     speed = math.hypot(twist[0], twist[1])
-    turn_speed = abs(twist[2]) * body.farthest_corner
+    turn_speed = abs(twist[2]) * stop.body.farthest_corner
     for _ in range(TIME_BISECTIONS):
         middle = 0.5 * (low + high)
-        drive_time, turn_time = _split_time(
-            middle, twist, braked_speed, body, reaction, deceleration
-        )
+        drive_time, turn_time = _split_time(middle, twist, braked_speed, stop)
         if speed * drive_time + turn_speed * turn_time < moved:
             low = middle
         else:
@@ -396,14 +345,13 @@ def _append_place(places: Array, s: int, arc: tuple[float, float, float]) -> Non
 
 
 @kernel
-def _compute_braking_time(
-    full_speed_time: float, speed: float, reaction: float, deceleration: float
-) -> float:
+def _compute_braking_time(full_speed_time: float, speed: float, stop: Stop) -> float:
     """Returns the time in which a braking robot gets as far as in a time at full speed [s]."""
-    if full_speed_time <= reaction:
+    braking_time = full_speed_time - stop.reaction
+    if braking_time <= 0.0:
         return full_speed_time
-    square = speed * speed - 2.0 * deceleration * speed * (full_speed_time - reaction)
-    return reaction + (speed - math.sqrt(max(square, 0.0))) / deceleration
+    square = speed * speed - 2.0 * stop.deceleration * speed * braking_time
+    return stop.reaction + (speed - math.sqrt(max(square, 0.0))) / stop.deceleration
 
 
 @kernel

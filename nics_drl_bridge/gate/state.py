@@ -208,19 +208,12 @@ class EstimateTrack:
 
 
 @dataclass(frozen=True)
-class ReducedScan:
-    """A scan reduced to few directions, and the pose it was taken from."""
-
-    stamp_ns: int  # of its header
-    pose: Array  # (3,) of the robot at that time, by odometry
-    ranges: Ranges  # (K,) median around each direction [m]; NaN where few beams return
-
-
-@dataclass(frozen=True)
 class ScanMotion:
     """Recent scans, and how much of the motion by odometry they show."""
 
-    views: tuple[ReducedScan, ...] = ()  # recent ones, oldest first
+    # recent ones, oldest first, with ranges (K,): medians around few directions [m]; NaN where few
+    # beams return
+    views: tuple[View, ...] = ()
     # stamp of the first scan that contradicts odometry
     held_since_ns: int | None = None
     held: str = ""  # what the newest scan contradicts, once earlier ones did too

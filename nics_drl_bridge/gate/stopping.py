@@ -86,7 +86,13 @@ def shield_config(
     path = find_config(file, "limits") if file else None
     measured = load_yaml(path, LimitsFile).shield if path else None
     overrides = overrides or {}
-    braking = _derive_braking_unless_given(model, limits, measured, overrides)
+    try:
+        braking = derive_braking(model, limits)
+    except ConfigError as error:
+        if measured is None and not overrides.keys() >= {"latency", "deceleration"}:
+            advice = "The file of limits may give it: `shield: {latency: .., deceleration: ..}`."
+            raise ConfigError(f"{error} {advice}") from None
+        braking = Braking(0.0, math.inf)
     stopping = {
         "latency": braking.reaction_s,
         "deceleration": min(braking.deceleration, HARDEST),
@@ -117,22 +123,6 @@ def shield_config(
         f"{name} {value:g}" for name, value in values.model_dump().items()
     )
     return config, f"the shield is on: {listed} ({source})"
-
-
-def _derive_braking_unless_given(
-    model: SimulatorModel,
-    limits: Limits | None,
-    measured: Stopping | None,
-    overrides: Mapping[str, float],
-) -> Braking:
-    """Returns `derive_braking`, or no braking for a model without rest whose stops are given."""
-    try:
-        return derive_braking(model, limits)
-    except ConfigError as error:
-        if measured is None and not overrides.keys() >= {"latency", "deceleration"}:
-            advice = "The file of limits may give it: `shield: {latency: .., deceleration: ..}`."
-            raise ConfigError(f"{error} {advice}") from None
-        return Braking(0.0, math.inf)
 
 
 def _adapt_turn(braking: Braking, stopping: Stopping) -> TurnBraking | None:

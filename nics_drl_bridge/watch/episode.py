@@ -92,10 +92,14 @@ class Lane:
         if self.state:
             self._over_s += self.env.model.control_period
             return False
+        action: Any
         if command is None:
             action = self._driver.act(self._observation)
+        elif self.task.actions == "discrete":
+            differences = np.abs(self.task.discrete_commands - command)
+            action = int(differences.sum(axis=-1).argmin())
         else:
-            action = self._choose_action(command)
+            action = scale_to_actions(self.task, command)
         self._observation, _, terminated, truncated, info = self._env.step(action)
         self.time_s += self.env.model.control_period
         self.trail.add(self.env.snapshot().poses, 1)
@@ -108,19 +112,13 @@ class Lane:
                 self.state = "time-out"
         return False
 
-    def _choose_action(self, command: NDArray[np.float64]) -> Any:
-        if self.task.actions == "discrete":
-            return int(
-                np.abs(self.task.discrete_commands - command).sum(axis=-1).argmin()
-            )
-        return scale_to_actions(self.task, command)
+    def restart(self, seed: float, world: AnyWorld | None = None) -> bool:
+        """Starts the episode of a seed in the original or another world.
 
-    def restart(self, seed: float) -> bool:
-        """Starts the episode of a seed in the original world; returns True if the env is new.
-
-        Raises ConfigError for a bad seed.
+        Returns True if the env is new. Raises ConfigError for a bad seed.
         """
         self.seed = int(check_seeds([seed])[0])
+        self._native = world or self._native
         changed = self.world is not self._native
         if changed:
             self.close()
@@ -128,45 +126,37 @@ class Lane:
         self.begin()
         return changed
 
-    def enter(self, world: AnyWorld) -> None:
-        """Starts the episode of the seed in another world."""
-        self.close()
-        self._open(self._policy, world)
-        self._native = world
-        self.begin()
-
-    def follow(self, policy: str) -> None:
-        """Continues from here with another policy."""
-        self._rebuild(policy)
-
     def aim(self, x: float, y: float) -> None:
         """Moves the goal [m]; continues after a success. Raises ConfigError off the field."""
         check_place("goal", self.env.world.members[self.env.snapshot().member], x, y)
         self.env.memory["goal"][...] = x, y
         if self.state == "success":
-            self._rebuild(self._policy)
+            self.rebuild()
 
-    def add(self, shape: Shape, x: float, y: float) -> None:
-        """Adds an obstacle [m]. Raises ConfigError if it touches a robot or is off the field."""
+    def add(self, request: Request) -> None:
+        """Adds an obstacle. Raises ConfigError if it touches a robot or is off the field."""
+        x = request.x
+        y = request.y
+        shape: Shape = Circle(radius=request.size)
+        if request.shape != "circle":
+            shape = Rectangle(size=(2.0 * request.size, 2.0 * request.size))
         reach = shape.radius + self.env.model.robot.footprint_radius
         distances = np.linalg.norm(self.env.snapshot().poses[:, :2] - (x, y), axis=1)
         if distances.min() <= reach:
             raise ConfigError(
                 f"an obstacle at ({x:.2f} m, {y:.2f} m) touches the robot; move it."
             )
-        self._rebuild(self._policy, Obstacles(shapes=(shape,), at=((x, y, 0.0),)))
+        self.rebuild("", Obstacles(shapes=(shape,), at=((x, y, 0.0),)))
 
-    def clear(self) -> None:
-        """Removes all obstacles."""
-        self._rebuild(self._policy, emptied=True)
-
-    def _rebuild(self, policy: str, *more: Obstacles, emptied: bool = False) -> None:
+    def rebuild(
+        self, policy: str = "", *more: Obstacles, emptied: bool = False
+    ) -> None:
         """Continues from here in a new env, with another policy or other obstacles."""
         shot = self.env.snapshot()
         kept = dict(vars(self))
         world = copy_world(self.env, *more, emptied=emptied)
         try:
-            self._open(policy, world)
+            self._open(policy or self._policy, world)
             self.begin(start=shot.poses[0], goal=shot.goals[0])
         except BaseException:
             vars(self).update(kept)
@@ -267,37 +257,26 @@ class EpisodeSource:
     def take(self, request: Request) -> bool:
         """See `show.FrameSource`."""
         lane = self.lanes[min(request.world, len(self.lanes) - 1)]
-        if request.kind == "goal":
+        kind = request.kind
+        if kind == "goal":
             lane.aim(request.x, request.y)
-        elif request.kind == "drive":
+        elif kind == "drive":
             self._drive(request)
-        elif request.kind == "policy":
-            for follower in self.lanes:
-                follower.follow(request.name)
+        elif kind == "obstacle":
+            lane.add(request)
+        elif kind == "clear":
+            lane.rebuild(emptied=True)
+        elif kind == "world":
+            given = self._given_worlds.get(request.name)
+            lane.restart(lane.seed, given or load_worlds(request.name))
+        elif kind == "policy":
+            for lane in self.lanes:
+                lane.rebuild(request.name)
             self._policy = request.name
-        elif request.kind in ("seed", "restart"):
-            for episodes in self.lanes:
-                is_restart = request.kind == "restart"
-                episodes.restart(episodes.seed if is_restart else request.value)
-        else:
-            return self._change_world(lane, request)
-        return request.kind in ("policy", "seed", "restart")
-
-    def _change_world(self, lane: Lane, request: Request) -> bool:
-        if request.kind == "obstacle":
-            shape: Shape = Circle(radius=request.size)
-            if request.shape != "circle":
-                side = 2.0 * request.size
-                shape = Rectangle(size=(side, side))
-            lane.add(shape, request.x, request.y)
-        elif request.kind == "clear":
-            lane.clear()
-        elif request.kind == "world":
-            world = self._given_worlds.get(request.name)
-            lane.enter(load_worlds(request.name) if world is None else world)
-        else:
-            return False
-        return True
+        elif kind in ("seed", "restart"):
+            for lane in self.lanes:
+                lane.restart(lane.seed if kind == "restart" else request.value)
+        return kind not in ("goal", "drive", "seek")
 
     def unfinished(self, episodes: int) -> bool:
         """Returns True until this many episodes have been driven and shown in every world."""

@@ -85,7 +85,7 @@ def _describe_place(world: World, shapes: Sequence[Shape]) -> dict[str, Any]:
         "name": world.name,
         "extent": world.extent,
         "walls": world.all_walls().tolist(),
-        "map": None if world.grid is None else _describe_map(world.grid),
+        "map": world.grid and _describe_map(world.grid),
         "shapes": outlines,
     }
 
@@ -119,7 +119,7 @@ class WorldFrame:
         exists = shot.bodies[:, RADIUS] > 0.0
         bodies = shot.bodies[exists]
         ranges = np.where(np.isfinite(shot.ranges), shot.ranges, NO_RETURN / MM)
-        return {
+        plain: dict[str, Any] = {
             "name": self.name,
             "place": self.place,
             "state": self.state,
@@ -132,16 +132,17 @@ class WorldFrame:
             "velocities": round_to_thousandths(velocities.robots),
             "body_velocities": round_to_thousandths(velocities.bodies[exists]),
             "trails": [round_to_thousandths(trail) for trail in self.trails],
-            "estimates": None
-            if shot.estimates is None
-            else round_to_thousandths(shot.estimates),
-            "ellipses": None
-            if shot.covariance is None
-            else [_compute_ellipse(c) for c in shot.covariance],
-            "commands": None
-            if shot.commands is None
-            else np.round(shot.commands, 3).tolist(),
+            "estimates": None,
+            "ellipses": None,
+            "commands": None,
         }
+        if shot.estimates is not None:
+            plain["estimates"] = round_to_thousandths(shot.estimates)
+        if shot.covariance is not None:
+            plain["ellipses"] = [_compute_ellipse(c) for c in shot.covariance]
+        if shot.commands is not None:
+            plain["commands"] = np.round(shot.commands, 3).tolist()
+        return plain
 
 
 def _compute_ellipse(covariance: Array) -> list[float]:

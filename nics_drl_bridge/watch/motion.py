@@ -65,24 +65,16 @@ def _measure_velocities(
 ) -> Velocities:
     passed_s = time_s - before.time_s
     last = before.shot
-    last_velocities = before.velocities
     if shot.member != last.member or not 0.0 <= passed_s <= LONGEST_S:
         return Velocities.unknown(shot)
-    places = [X, Y]
-    return Velocities(
-        _compute_rates(
-            last.poses[:, :2], shot.poses[:, :2], passed_s, last_velocities.robots
-        ),
-        _compute_rates(
-            last.bodies[:, places],
-            shot.bodies[:, places],
-            passed_s,
-            last_velocities.bodies,
-        ),
+    rows = (
+        (last.poses[:, :2], shot.poses[:, :2], before.velocities.robots),
+        (last.bodies[:, [X, Y]], shot.bodies[:, [X, Y]], before.velocities.bodies),
     )
+    return Velocities(*(_compute_rates(passed_s, *row) for row in rows))
 
 
-def _compute_rates(before: Array, now: Array, passed_s: float, last: Array) -> Array:
+def _compute_rates(passed_s: float, before: Array, now: Array, last: Array) -> Array:
     """Returns velocities (n, 2) from points (n, 2); `last` (n, 2) if no time has passed."""
     if before.shape != now.shape:
         return np.zeros_like(now)

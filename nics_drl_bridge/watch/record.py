@@ -74,15 +74,15 @@ def write_mp4(path: Path, shown: Iterable[Pixels], fps: float) -> None:
     first = next(shown)
     height, width = first.shape[:2]
     with write_whole_file(path) as part:
-        options = {
-            "fps": fps,
-            "macro_block_size": 2,
-            "quality": 8,
-            "ffmpeg_log_level": "error",
-        }
-        with closing(
-            imageio_ffmpeg.write_frames(str(part), (width, height), **options)
-        ) as video:
+        video = imageio_ffmpeg.write_frames(
+            str(part),
+            (width, height),
+            fps=fps,
+            macro_block_size=2,
+            quality=8,
+            ffmpeg_log_level="error",
+        )
+        with closing(video):
             video.send(None)
             for pixels in chain([first], shown):
                 video.send(np.ascontiguousarray(pixels))

@@ -165,20 +165,17 @@ class PageServer:
         from websockets.datastructures import Headers
         from websockets.http11 import Response
 
+        refuse = connection.respond
         host = ", ".join(request.headers.get_all("Host"))
         if host not in self._hosts:  # a foreign host name may point to this machine
-            return connection.respond(
-                403, "This page is served to this machine only.\n"
-            )
+            return refuse(403, "This page is served to this machine only.\n")
         if request.path == "/socket":
             origins = request.headers.get_all("Origin")  # empty for programs
             if all(origin.removeprefix("http://") in self._hosts for origin in origins):
                 return None
-            return connection.respond(
-                403, "This socket is open to its own page only.\n"
-            )
+            return refuse(403, "This socket is open to its own page only.\n")
         if request.path != "/":
-            return connection.respond(404, "The only page is /.\n")
+            return refuse(404, "The only page is /.\n")
         body = files("nics_drl_bridge.watch").joinpath("page.html").read_bytes()
         about = {
             "Content-Type": "text/html; charset=utf-8",

@@ -202,38 +202,3 @@ def test_other_limits_in_the_same_file_are_refused_by_their_hash(evidence, tmp_p
     refused = nics(ORDER, "--out out", cwd=folder)
     assert refused.returncode == 2
     assert "'hashes.limits file, SHA-256' was" in refused.stderr
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        ("assure random --limits differential", "'random' is a baseline"),
-        ("assure differntial --limits differential", "unknown policy 'differntial'"),
-        ("assure no.onnx --limits differential", "no.onnx"),
-        ("assure differential", "Missing option '--limits'"),
-        ("assure differential --limits mecanum", "the limits are for 'mecanum'"),
-        ("assure differential --limits nothing", "unknown limits 'nothing'"),
-        ("assure mecanum --limits mecanum --model differential", "mecanum"),
-        ("assure differential --limits differential --world no", "unknown world 'no'"),
-        ("assure differential --limits differential --episodes 0", "--episodes"),
-        ("assure differential --limits differential --seed -1", "--seed"),
-        ("assure differential --limits differential --control off", "--control"),
-        ("assure differential --limits differential --replay 1", "assurance.json"),
-        (
-            "assure differential --limits differential --seed 9223372036854775800",
-            "seed",
-        ),
-        (
-            "assure differential --limits differential --randomisation hot",
-            "unknown randomisation 'hot'",
-        ),
-    ],
-)
-def test_wrong_input_is_refused_in_one_sentence_before_anything_is_written(
-    tmp_path, words, named
-):
-    refused = nics(words, cwd=tmp_path)
-    assert refused.returncode == 2
-    (sentence,) = refused.stderr.splitlines()
-    assert named in sentence
-    assert list(tmp_path.iterdir()) == []

@@ -143,6 +143,21 @@ MISTAKES = {
     "drive --robot differential --out m --duration nan": "--duration.*(finite|should)",
     "bag replay bag --rate nan": "--rate.*(must be a finite number|Input should be)",
     "world import house.world --start 0 nan 0": "--start nan: must be a finite number",
+    # Evidence for a policy behind the gate.
+    "assure random --limits differential": "'random' is a baseline",
+    "assure differntial --limits differential": "unknown policy 'differntial'",
+    "assure no.onnx --limits differential": "no.onnx",
+    "assure differential": "Missing option '--limits'",
+    "assure differential --limits mecanum": "the limits are for 'mecanum'",
+    "assure differential --limits nothing": "unknown limits 'nothing'",
+    "assure mecanum --limits mecanum --model differential": "mecanum",
+    "assure differential --limits differential --world no": "unknown world 'no'",
+    "assure differential --limits differential --episodes 0": "--episodes",
+    "assure differential --limits differential --seed -1": "--seed",
+    "assure differential --limits differential --control off": "--control",
+    "assure differential --limits differential --replay 1": "assurance.json",
+    f"assure differential --limits differential --seed {2**63 - 8}": "seed",
+    "assure differential --limits differential --randomisation hot": "randomisation 'hot'",
     # What a policy sees, and where results go.
     "evaluate differential --lidar hokuyo_ust_10lx --in fast": "does not suit this "
     "lidar: .* in base_link, the scan layout needs .*; use another lidar, or a policy trained for",

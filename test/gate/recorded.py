@@ -171,6 +171,7 @@ class FaultyDrive:
         self.picture = None
         self.fault = ""
         self.words = ()
+        self.answer = ""  # the last one to a request
         self.lines = []
         self.decisions = []
         self.sums = [projected(flatten(self.state))]
@@ -179,12 +180,11 @@ class FaultyDrive:
         now = 128.0 + self.units * UNIT_S
         self.state, decision = decide(self.config, self.state, event, now)
         rule = "" if decision.cause is None else decision.cause.line
-        words = (rule.partition(":")[0], decision.answer, decision.refused)
+        self.answer = decision.answer or self.answer
+        words = (rule.partition(":")[0], self.answer, decision.refused)
         if words != self.words:
             self.words = words
-            self.lines.append(
-                f"{self.units} {rule} {decision.answer} {decision.refused}"
-            )
+            self.lines.append(f"{self.units} {rule} {self.answer} {decision.refused}")
         self.decisions.append(decision)
         return decision
 
@@ -250,8 +250,10 @@ class FaultyDrive:
         self.rng = np.random.default_rng(FAULTS.index(fault))
         self.body = self.rng.uniform(-1.0, 1.0, 3)
         self.give(Reset())
-        self.run(40)
-        self.give(Arm(1))
+        for _ in range(40):
+            self.run(1)
+            if not self.state.armed:
+                self.give(Arm(1))
         self.run(30)
         self.fault = fault
         if fault == "asleep":
@@ -262,7 +264,7 @@ class FaultyDrive:
     def recover(self):
         """Has no fault any more, and is told to stand."""
         self.fault = "stopped"
-        self.run(32)
+        self.run(8)
 
 
 def record_drive(name, check=lambda drive, fault, stopped: None):
@@ -296,7 +298,7 @@ def record_stops():
             points = rng.uniform(-1.0, 1.0, (40, 1, 3)) * (1.0, 1.0, 0.5)
             points[::2, :, 2] = 0.0
             free += [
-                shield_kernels.is_free(point, twist[None], *stop, 0.02)
+                shield_kernels.is_free(point, twist[None], stop, 0.02)
                 for point in points
                 for twist in twists
             ]

@@ -56,7 +56,10 @@ class Rig:
         wish: (3,) what the policy sends.
         frozen: whether the scans stay the same.
         covariance: (3, 3) of the estimated pose.
+        tick_s: between two ticks of the gate [s].
     """
+
+    tick_s = TICK_S
 
     def __init__(self, given: GateConfig | None = None) -> None:
         self.config = given or config()
@@ -104,11 +107,11 @@ class Rig:
 
     def run(self, seconds: float, without: str = ""):
         """Lets time pass; topics named in `without` are silent."""
-        for _ in range(round(seconds / TICK_S)):
-            self.now += TICK_S
+        for _ in range(round(seconds / self.tick_s)):
+            self.now += self.tick_s
             self.ticks += 1
-            self.pose = self.pose + np.array([self.speed * TICK_S, 0.0, 0.0])
-            if self.ticks % round(PERIOD_S / TICK_S) == 0:
+            self.pose = self.pose + np.array([self.speed * self.tick_s, 0.0, 0.0])
+            if self.ticks % round(PERIOD_S / self.tick_s) == 0:
                 self.send(without)
             self.tick()
         return self.decision

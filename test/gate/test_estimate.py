@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gate.rig import Rig, config, driving
+from gate.rig import PERIOD_S, Rig, config, driving
 from nics_drl_bridge.gate.estimate import WINDOW_S, compute_growth
 from nics_drl_bridge.gate.inputs import Estimate, Reset
 from nics_drl_bridge.gate.state import EstimateMark
@@ -85,6 +85,8 @@ def test_what_an_uncertain_heading_does_over_the_way_driven_is_no_growth():
 
 class DeadReckoning(Rig):
     """A robot whose estimator hears odometry alone."""
+
+    tick_s = PERIOD_S
 
     def __init__(self):
         super().__init__(config("differential", estimate_position=0.1))

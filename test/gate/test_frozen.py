@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from gate.rig import LIDAR, TICK_S, Rig, config, driving
-from nics_drl_bridge.gate.frozen import is_at_rest
+from nics_drl_bridge.gate.frozen import is_at_rest, watch_pictures
 from nics_drl_bridge.gate.inputs import Reset
+from nics_drl_bridge.gate.state import Sameness
 
 
 def room(x, size=(2.5, 1.5)):
@@ -77,13 +78,24 @@ def test_a_lidar_of_few_beams_that_is_frozen_but_for_one_is_frozen(beams, flicke
     assert_frozen(rig)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1.5])
-def test_a_frozen_scan_of_a_single_pole_is_frozen(angle):
-    rig = Looking().drive()
+@pytest.mark.parametrize(
+    ("angle", "beams", "count", "words"),
+    [
+        (0.0, 5, 2, "3 scans are the same over a motion of 0.30 m or rad"),
+        (1.5, 3, 2, "3 scans are the same over a motion of 0.30 m or rad"),
+        (1.5, 2, 2, ""),
+        (0.0, 5, 1, ""),
+    ],
+)
+def test_a_third_scan_of_a_single_pole_is_frozen_if_three_beams_must_change(
+    angle, beams, count, words
+):
     pole = np.full(LIDAR.beams, np.inf, np.float32)
-    pole[np.argsort(np.abs(LIDAR.angles - angle))[:5]] = 1.5
-    rig.broken = lambda true: pole
-    assert_frozen(rig)
+    pole[np.argsort(np.abs(LIDAR.angles - angle))[:beams]] = 1.5
+    seen = (Sameness(pole, count, np.zeros(3)),)
+    moved = np.array([0.3, 0.0, 0.0])
+    (picture,), fault = watch_pictures(config(), seen, pole, moved)
+    assert (picture.count, fault) == (count + 1 if words or count == 1 else 1, words)
 
 
 def test_a_picture_counts_from_the_third_time_it_is_shown_and_once_there_is_odometry():

@@ -15,7 +15,7 @@ from nics_drl_bridge.gate.evidence import find_obstacles, make_static
 from nics_drl_bridge.gate.footprint import get_body
 from nics_drl_bridge.gate.ground import REMEMBERED_S, update_ground
 from nics_drl_bridge.gate.shield import STEP
-from nics_drl_bridge.gate.shield_kernels import is_free
+from nics_drl_bridge.gate.shield_kernels import Stop, is_free
 from nics_drl_bridge.gate.state import ShieldConfig, View
 from nics_drl_bridge.interface import NS_PER_S
 
@@ -32,9 +32,8 @@ SHIELD = ShieldConfig(
 )
 ANGLES = np.deg2rad(np.linspace(-135.0, 135.0, 541))
 BLIND = config(shield=SHIELD, beam_angles=ANGLES, mount=(0.12, 0.0, 0.0))
-BODY = get_body(SHIELD)
+STOP = Stop(get_body(SHIELD), 0.0, 0.0, 0.2, 2.0)
 PERIOD_S = 0.1
-REACT_S = 0.2
 SEEDS = 5
 FAR = np.zeros((0, 4))
 BOX = np.array(
@@ -68,9 +67,8 @@ class Robot:
 
     def may(self, twist):
         twists = np.array([twist], dtype=float)
-        return is_free(
-            self.seen, twists, get_body(self.given.shield), REACT_S, 2.0, STEP
-        )
+        stop = STOP._replace(body=get_body(self.given.shield))
+        return is_free(self.seen, twists, stop, STEP)
 
     def moves(self, twist, seconds=PERIOD_S):
         for _ in range(round(seconds / PERIOD_S)):
@@ -97,7 +95,7 @@ def test_at_the_start_the_ground_behind_is_free_as_far_as_all_that_it_sees(
     view = View(0, np.zeros(3), ranges)
     behind = make_static(update_ground(BLIND, (view,), None).unseen)
     twist = np.array([[0.0, 0.0, 2.0]])
-    assert is_free(behind, twist, BODY, REACT_S, 2.0, STEP) == may
+    assert is_free(behind, twist, STOP, STEP) == may
 
 
 def test_it_backs_up_as_far_as_it_came_and_no_faster_than_it_can_stop():

@@ -14,7 +14,7 @@ from nics_drl_bridge.gate.evidence_kernels import (
 )
 from nics_drl_bridge.gate.footprint import get_body
 from nics_drl_bridge.gate.ground_kernels import Grid, mark_seen
-from nics_drl_bridge.gate.shield_kernels import is_free
+from nics_drl_bridge.gate.shield_kernels import Stop, is_free
 from nics_drl_bridge.gate.state import ShieldConfig
 
 BRAKE = 1.5
@@ -24,13 +24,12 @@ LONG = ((0.25, 0.2), (-0.25, 0.2), (-0.25, -0.2), (0.25, -0.2))
 FORK = ((0.4, 0.2), (0.1, 0.15), (0.1, -0.15), (0.4, -0.2), (-0.2, -0.2), (-0.2, 0.2))
 
 
-def body(outline, margin=MARGIN):
+def stop(outline, blind=0.5):
     radius = 0.2 if not outline else float(np.hypot(*np.array(outline).T).max())
-    return get_body(
-        ShieldConfig(
-            0.2, BRAKE, margin, 0.2, radius, outline=outline, obstacle_speed=0.0
-        )
+    shield = ShieldConfig(
+        0.2, BRAKE, MARGIN, 0.2, radius, outline=outline, obstacle_speed=0.0
     )
+    return Stop(get_body(shield), 0.0, 0.0, blind, BRAKE)
 
 
 def star(rng):
@@ -82,7 +81,7 @@ def test_the_sweep_is_that_of_a_fine_one_by_exact_distances(make, speed):
         leaves = now < MARGIN and least > -1e-12
         if abs(least) < STEP and not leaves:
             continue
-        found = is_free(point[None], twist[None], body(outline), blind, BRAKE, STEP)
+        found = is_free(point[None], twist[None], stop(outline, blind), STEP)
         assert found == (least > 0.0 or leaves), (outline, point, twist, blind)
         told.append(found)
     assert 5 < sum(told) < len(told) - 5
@@ -107,7 +106,7 @@ def test_the_sweep_is_that_of_a_fine_one_by_exact_distances(make, speed):
 )
 def test_a_robot_may_leave_what_is_near_and_not_come_nearer(outline, point, twist, may):
     obstacles = np.array([[*point, 0.0]])
-    found = is_free(obstacles, np.array([twist]), body(outline), 0.5, BRAKE, STEP)
+    found = is_free(obstacles, np.array([twist]), stop(outline), STEP)
     assert found == may
 
 
@@ -117,7 +116,7 @@ def test_who_catches_up_from_behind_finds_the_robot_at_rest(away, may):
     twists = np.array([[0.3, 0.0, 0.0]])
     for speed in (1.0, 0.0):
         behind = np.array([[-away, 0.1, speed]])
-        found = is_free(behind, twists, body(()), 0.5, BRAKE, 0.02)
+        found = is_free(behind, twists, stop(()), 0.02)
         assert found == (may or speed == 0.0)
 
 
@@ -125,7 +124,7 @@ def test_who_catches_up_from_behind_finds_the_robot_at_rest(away, may):
 def test_a_speed_next_to_nothing_is_swept(speed):
     twist = np.array([[speed, 0.0, 0.0]])
     ahead = np.array([[0.29, 0.0, 0.0], [9.0, 0.0, 1e-9]])
-    assert is_free(ahead, twist, body(LONG), 0.5, BRAKE, STEP)
+    assert is_free(ahead, twist, stop(LONG), STEP)
 
 
 @pytest.mark.parametrize("unknown", [(), (19,), (20,), (21,), (19, 21)])

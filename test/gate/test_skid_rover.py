@@ -63,7 +63,7 @@ def test_a_point_that_the_shield_takes_for_free_is_never_touched_by_a_stop(
         if compute_clearance(x, y, body) < shield.margin:
             continue
         point = np.array([[x, y, 0.0]])
-        if not all(is_free(point, twist, *stop, STEP) for stop in stops):
+        if not all(is_free(point, twist, stop, STEP) for stop in stops):
             continue
         count += 1
         c = np.cos(poses[:, 2])

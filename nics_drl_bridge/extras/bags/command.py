@@ -26,38 +26,35 @@ StorageOption = Annotated[
 
 @bag.command()
 def record(
-    out: Annotated[Path, Argument(help="Folder of the bag to write.")],
-    topics: Annotated[
-        list[str] | None, Option(help="A topic to record; repeatable.")
-    ] = None,
-    everything: Annotated[bool, Option("--all", help="Record every topic.")] = False,
+    out: Path,
+    topics: list[str] | None = None,
+    everything: Annotated[bool, Option("--all")] = False,
     namespace: console.NamespaceOption = "",
-    duration: Annotated[
-        float | None, Option(min=0.0, help="Stop after this time [s]; else at Ctrl-C.")
-    ] = None,
+    duration: Annotated[float | None, Option(min=0.0)] = None,
     storage: StorageOption = defaults.BAG_STORAGE,
-    use_sim_time: Annotated[
-        bool, Option("--use-sim-time", help="Take time from /clock.")
-    ] = False,
+    use_sim_time: console.SimTimeOption = False,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Records a robot's topics without driving it."""
+    """Records a robot's topics without driving it.
+
+    Args:
+        out: Folder of the bag to write.
+        topics: A topic to record; repeatable.
+        everything: Record every topic.
+        duration: Stop after this time [s]; else at Ctrl-C.
+
+    Examples:
+        nics bag record drive --duration 60
+    """
     with extensions.require_modules("nics bag record"):
         from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
         from nics_drl_bridge.nodes.own_process import forward_errors
     names = tuple(topics or ())
-    say = partial(typer.echo, err=True)
-    order = BagOrder(
-        out,
-        names,
-        everything,
-        parse_namespace(namespace),
-        duration,
-        storage,
-        use_sim_time,
-    )
+    space = parse_namespace(namespace)
+    order = BagOrder(out, names, everything, space, duration, storage, use_sim_time)
     with forward_errors():
-        counts = dict(sorted(record_bag(order, say).items()))
+        counts = record_bag(order, partial(typer.echo, err=True))
+    counts = dict(sorted(counts.items()))
     lines = [f"{topic}: {count} messages" for topic, count in counts.items()]
     lines.append(f"bag written to {out}")
     console.print_line(as_json, "\n".join(lines), path=str(out), messages=counts)
@@ -68,7 +65,11 @@ def info(
     path: BagArgument,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Shows a bag's topics, rates, gaps, and the clock of its stamps."""
+    """Shows a bag's topics, rates, gaps, and the clock of its stamps.
+
+    Examples:
+        nics bag info drive --json
+    """
     from nics_drl_bridge.extras.bags.info import read_bag_info
 
     contents = read_bag_info(path)
@@ -115,64 +116,60 @@ def _replay_estimator(
 @bag.command()
 def replay(
     path: BagArgument,
-    rate: Annotated[
-        float, Option(min=0.001, help="Seconds of the bag per second.")
-    ] = 1.0,
-    loop: Annotated[bool, Option("--loop", help="Start again at the end.")] = False,
-    clock: Annotated[bool, Option(help="Publish the bag's time on /clock.")] = True,
-    topics: Annotated[
-        list[str] | None, Option(help="Play this topic only; repeatable.")
-    ] = None,
-    namespace: Annotated[str, Option(help="Prefix of the topics' names.")] = "",
-    lockstep: Annotated[
-        str | None,
-        Option(
-            metavar="NODE",
-            help="Wait after each message until this node has received it.",
-        ),
-    ] = None,
-    estimate: Annotated[
-        bool,
-        Option("--estimate", help="Run the middleware on the bag in process instead."),
-    ] = False,
-    model: Annotated[
-        str,
-        console.make_robot_option(
-            "For --estimate: folder of a model, or a shipped robot."
-        ),
-    ] = DEFAULT_ROBOT,
+    rate: Annotated[float, Option(min=0.001)] = 1.0,
+    loop: Annotated[bool, Option("--loop")] = False,
+    clock: bool = True,
+    topics: list[str] | None = None,
+    namespace: str = "",
+    lockstep: Annotated[str | None, Option(metavar="NODE")] = None,
+    estimate: Annotated[bool, Option("--estimate")] = False,
+    model: console.RobotOption = DEFAULT_ROBOT,
     topic: console.RolesOption = None,
-    out: Annotated[
-        Path | None, Option(help="For --estimate: .npz or .csv to write.")
-    ] = None,
+    out: Path | None = None,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Plays a bag over ROS 2, or runs the middleware's estimator on it."""
+    """Plays a bag over ROS 2, or runs the middleware's estimator on it.
+
+    Args:
+        rate: Seconds of the bag per second.
+        loop: Start again at the end.
+        clock: Publish the bag's time on /clock.
+        topics: Play this topic only; repeatable.
+        namespace: Prefix of the topics' names.
+        lockstep: Wait after each message until this node has received it.
+        estimate: Run the middleware on the bag in process instead.
+        model: For --estimate: folder of a model, or a shipped robot.
+        out: For --estimate: .npz or .csv to write.
+
+    Examples:
+        nics bag replay drive --rate 2
+    """
     if estimate:
         _replay_estimator(path, model, topic or [], out, as_json)
         return
     with extensions.require_modules("nics bag replay"):
-        from nics_drl_bridge.extras.bags.live import play_bag
-    say = partial(typer.echo, err=True)
-    sent = play_bag(path, topics or (), rate, loop, clock, namespace, lockstep, say)
+        from nics_drl_bridge.extras.bags.live import PlayOrder, play_bag
+    order = PlayOrder(path, topics or (), rate, loop, clock, namespace, lockstep)
+    sent = play_bag(order, partial(typer.echo, err=True))
     console.print_line(as_json, f"{sent} messages were published", published=sent)
 
 
 @bag.command()
 def export(
     path: BagArgument,
-    mcap: Annotated[
-        Path, Option(metavar="FOLDER", help="Write an MCAP bag for Foxglove.")
-    ],
-    model: Annotated[
-        str | None,
-        console.make_robot_option(
-            "A model's folder, or a shipped robot: for its lidar's mount."
-        ),
-    ] = None,
+    mcap: Annotated[Path, Option(metavar="FOLDER")],
+    model: console.OptionalRobotOption = None,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Converts a bag to MCAP for Foxglove."""
+    """Converts a bag to MCAP for Foxglove.
+
+    Args:
+        mcap: Write an MCAP bag for Foxglove.
+        model: A model's folder, or a shipped robot: for its lidar's mount.
+
+    Examples:
+        nics bag export drive --mcap shown --model my_robot
+    """
     from nics_drl_bridge.extras.bags.convert import convert
     from nics_drl_bridge.generator import open_model
 

@@ -49,11 +49,9 @@ def convert(
 
 
 def _convert_moving(bag: BagFile, store: Any) -> Iterator[Row]:
-    for message in (
-        []
-        if MOVING in bag.types
-        else _make_messages(bag, f"/{ODOM}", topic_roles.ODOMETRY)
-    ):
+    if MOVING in bag.types:
+        return
+    for message in _make_messages(bag, f"/{ODOM}", topic_roles.ODOMETRY):
         odometry = message.content
         pose = odometry.pose.pose
         place = pose.position.x, pose.position.y, pose.position.z
@@ -74,18 +72,13 @@ def _convert_fixed(
     turned = store.types["geometry_msgs/msg/Quaternion"](
         0.0, 0.0, np.sin(half), np.cos(half)
     )
-    bases = [
-        m.content.child_frame_id
-        for m in _make_messages(bag, f"/{ODOM}", topic_roles.ODOMETRY)
-    ]
+    base = FRAMES[1]
+    for message in _make_messages(bag, f"/{ODOM}", topic_roles.ODOMETRY)[:1]:
+        base = message.content.child_frame_id
     scan = scans[0].content.header
-    base = (*bases, FRAMES[1])[0]
     header = store.types["std_msgs/msg/Header"](scan.stamp, base)
-    yield (
-        FIXED,
-        bag.span_ns[0],
-        _transform(store, header, scan.frame_id, (x, y, 0.0), turned),
-    )
+    transform = _transform(store, header, scan.frame_id, (x, y, 0.0), turned)
+    yield FIXED, bag.span_ns[0], transform
 
 
 def _make_messages(bag: BagFile, topic: str, kind: str) -> list[Message]:

@@ -58,13 +58,14 @@ def read_bag_info(path: str | Path) -> BagInfo:
         received = {topic: _read_receipt(bag, topic) for topic in sorted(bag.types)}
         times = np.concatenate([ns for ns, _ in received.values()])
         start = int(times.min())
-        end = int(times.max())
+        duration_s = (int(times.max()) - start) * S_PER_NS
         topics = tuple(
             _describe_topic(topic, bag.types[topic], ns - start, delays)
             for topic, (ns, delays) in received.items()
         )
-    size = _measure_size(path)
-    return BagInfo(str(path), size, start, (end - start) * S_PER_NS, len(times), topics)
+    return BagInfo(
+        str(path), _measure_size(path), start, duration_s, len(times), topics
+    )
 
 
 def _measure_size(path: Path) -> int:
@@ -89,7 +90,18 @@ def _describe_topic(
 ) -> BagTopic:
     clock: dict[str, Any] = {"clock": delays}
     if not isinstance(delays, str):
-        clock = _describe_clock(since, delays)
+        quantiles = np.percentile(delays * S_PER_NS, (5.0, 50.0, 95.0))
+        low, middle, high = quantiles.tolist()
+        clock = {
+            "clock": FOREIGN,
+            "delay_s": middle,
+            "jitter_s": high - low,
+            "backwards": int((np.diff(since - delays) < 0).sum()),
+        }
+        if high - low > MAX_WANDER_S:
+            clock["clock"] = SEVERAL
+        elif SAME_CLOCK_S[0] <= middle <= SAME_CLOCK_S[1]:
+            clock["clock"] = RECORDER
     if not len(since):
         return BagTopic(topic, kind, 0, **clock)
     intervals = np.diff(since) * S_PER_NS
@@ -105,18 +117,3 @@ def _describe_topic(
         longest_gap_s=float(intervals.max()) if len(intervals) else None,
         **clock,
     )
-
-
-def _describe_clock(since: Nanoseconds, delays: Nanoseconds) -> dict[str, Any]:
-    low, middle, high = np.percentile(delays * S_PER_NS, (5.0, 50.0, 95.0)).tolist()
-    clock = FOREIGN
-    if high - low > MAX_WANDER_S:
-        clock = SEVERAL
-    elif SAME_CLOCK_S[0] <= middle <= SAME_CLOCK_S[1]:
-        clock = RECORDER
-    return {
-        "clock": clock,
-        "delay_s": middle,
-        "jitter_s": high - low,
-        "backwards": int((np.diff(since - delays) < 0).sum()),
-    }

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rcl_interfaces.srv import GetParameters
 from rclpy.duration import Duration
@@ -239,38 +239,72 @@ def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
 Timed = tuple[int, str, bytes]  # receive time [ns], topic, data
 
 
+@dataclass(frozen=True)
+class PlayOrder:
+    """A bag to play, and options."""
+
+    path: Path
+    topics: Sequence[str] = ()  # names; empty: all of its topics
+    rate: float = 1.0  # seconds of the bag per second
+    loop: bool = False  # True: start again at the end
+    # True: publish receive times on `/clock`, instead of the bag's own clock
+    clock: bool = True
+    namespace: str = ""  # prefix of topic names
+    lockstep: str | None = None  # node that must have received each message
+
+    def list_wanted(self, bag: BagFile) -> list[str]:
+        """Returns the topics to play. Raises RecordingError if the bag lacks one."""
+        names = [name if name.startswith("/") else f"/{name}" for name in self.topics]
+        for name in names:
+            if name not in bag.types:
+                raise RecordingError(
+                    f"{bag.place}: has no topic {name!r}; {suggest(name, bag.types)}"
+                )
+        left_out = {*bag.empty, *([CLOCK] if self.clock else [])}
+        return [topic for topic in sorted(names or bag.types) if topic not in left_out]
+
+
 class _Player:
-    def __init__(
-        self,
-        node: Node,
-        stopping: threading.Event,
-        rate: float,
-        clock: bool,
-        namespace: str,
-        lockstep: str | None,
-    ) -> None:
+    def __init__(self, node: Node, stopping: threading.Event, order: PlayOrder) -> None:
         self._node = node
         self._stopping = stopping
-        self._rate = rate
-        self._lockstep = lockstep
-        self._space = parse_namespace(namespace)
+        self._order = order
         self.publishers: dict[str, Publisher] = {}
-        self._clock = node.create_publisher(ClockMessage, CLOCK, 10) if clock else None
+        self._clock = None
+        if order.clock:
+            self._clock = node.create_publisher(ClockMessage, CLOCK, 10)
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._barrier = None
-        if lockstep:
-            service = f"/{lockstep.strip('/')}/get_parameters"
+        if order.lockstep:
+            service = f"/{order.lockstep.strip('/')}/get_parameters"
             self._barrier = node.create_client(GetParameters, service)
 
-    def offer(self, topic: str, kind: str, offers: tuple[Offer, ...]) -> bool:
+    def offer_bag(self, say: Callable[[str], None]) -> list[Timed]:
+        """Offers the topics of the bag; returns its messages by receive time, then by topic."""
+        timed: list[Timed] = []
+        with open_bag(self._order.path) as bag:
+            for topic in self._order.list_wanted(bag):
+                kind = bag.types[topic]
+                if self._offer(topic, kind, bag.offers(topic)):
+                    messages = bag.read_serialized(topic)
+                    timed += ((ns, topic, data) for ns, data in messages)
+                else:
+                    why = f"is of {kind}, whose package is not installed"
+                    say(f"left out: {topic} {why}.")
+        if not timed:
+            raise RecordingError(
+                f"{self._order.path}: contains nothing that can be played here."
+            )
+        return sorted(timed, key=lambda message: message[:2])
+
+    def _offer(self, topic: str, kind: str, offers: tuple[Offer, ...]) -> bool:
         message_class = find_message_type(kind)
         if message_class is None:
             return False
-        if topic in (CLOCK, "/tf", "/tf_static"):
-            name = topic
-        else:
-            name = f"{self._space}{topic}"
+        name = topic
+        if topic not in (CLOCK, "/tf", "/tf_static"):
+            name = f"{parse_namespace(self._order.namespace)}{topic}"
         best = Offer(  # compatible with every subscriber of any original publisher
             max((offer.depth for offer in offers), default=USUAL_DEPTH),
             not offers or any(offer.reliable for offer in offers),
@@ -300,9 +334,8 @@ class _Player:
             self._barrier.service_is_ready, PATIENCE_S
         ):
             fix = "start it, or correct its name, namespace or ROS_DOMAIN_ID."
-            raise BackendError(
-                f"node {self._lockstep!r}: not found within {PATIENCE_S:g} s; {fix}"
-            )
+            peer = f"node {self._order.lockstep!r}"
+            raise BackendError(f"{peer}: not found within {PATIENCE_S:g} s; {fix}")
 
     def _wait(self, condition: Callable[[], bool], patience_s: float) -> bool:
         return holds(lambda: condition() or self._stopping.is_set(), patience_s, NAP_S)
@@ -310,16 +343,17 @@ class _Player:
     def play(self, messages: list[Timed]) -> int:
         now = first = messages[0][0]
         began = time.monotonic_ns()
-        rate = self._rate
+        rate = self._order.rate
+        lockstep = bool(self._order.lockstep)
         for sent, (due, topic, data) in enumerate(messages):
-            while self._lockstep is None and now < due and not self._stopping.is_set():
+            while not lockstep and now < due and not self._stopping.is_set():
                 now = min(due, now + round(CLOCK_PERIOD_NS * rate))
                 at = began + round((now - first) / rate)
                 self._stopping.wait(max(at - time.monotonic_ns(), 0) * 1e-9)
                 self._tick(now)
             if self._stopping.is_set():
                 return sent
-            if self._lockstep is not None:
+            if lockstep:
                 self._tick(due)
             self.publishers[topic].publish(data)
             self._wait_for_peer()
@@ -337,47 +371,27 @@ class _Player:
         self._executor.spin_until_future_complete(future, timeout_sec=PATIENCE_S)
         if not future.done():
             fix = f"{PATIENCE_S:g} s; it hangs or has ended: start it again."
-            raise BackendError(f"node {self._lockstep!r}: has not answered for {fix}")
+            peer = f"node {self._order.lockstep!r}"
+            raise BackendError(f"{peer}: has not answered for {fix}")
 
 
-def play_bag(
-    path: Path,
-    topics: Sequence[str],
-    rate: float,
-    loop: bool,
-    clock: bool,
-    namespace: str,
-    lockstep: str | None,
-    say: Callable[[str], None],
-) -> int:
+def play_bag(order: PlayOrder, say: Callable[[str], None]) -> int:
     """Publishes a bag until its end, SIGINT or SIGTERM; returns the number of published messages.
 
-    The rate is in seconds of the bag per second. `clock` publishes receive times on `/clock`
-    instead of the bag's own clock. Raises RecordingError if the bag is damaged, lacks a topic, or
-    none of its types is installed, BackendError if the peer does not answer.
+    Raises RecordingError if the bag is damaged, lacks a topic, or none of its types is installed,
+    BackendError if the peer does not answer.
     """
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopping.set())
-    bag = _read_played(path, topics, clock)
     context = open_context([])
     node = Node("bag_player", context=context, start_parameter_services=False)
     try:
-        player = _Player(node, stopping, rate, clock, namespace, lockstep)
-        timed: list[Timed] = []
-        for topic in bag:
-            if player.offer(topic.name, topic.kind, topic.offers):
-                timed += ((ns, topic.name, data) for ns, data in topic.messages)
-            else:
-                say(
-                    f"left out: {topic.name} is of {topic.kind}, whose package is not installed."
-                )
-        timed.sort(key=lambda message: message[:2])  # by receive time, then by topic
-        if not timed:
-            raise RecordingError(f"{path}: contains nothing that can be played here.")
+        player = _Player(node, stopping, order)
+        timed = player.offer_bag(say)
         player.wait_for_subscribers()
         sent = player.play(timed)
-        while loop and not stopping.is_set():
+        while order.loop and not stopping.is_set():
             sent += player.play(timed)
         # Destroying the node would drop undelivered messages.
         for each in player.publishers.values():
@@ -386,31 +400,3 @@ def play_bag(
     finally:
         node.destroy_node()
         context.try_shutdown()
-
-
-class _PlayedTopic(NamedTuple):
-    name: str
-    kind: str
-    offers: tuple[Offer, ...]
-    messages: list[tuple[int, bytes]]  # receive time [ns], data
-
-
-def _read_played(path: Path, topics: Sequence[str], clock: bool) -> list[_PlayedTopic]:
-    with open_bag(path) as bag:
-        return [
-            _PlayedTopic(
-                topic, bag.types[topic], bag.offers(topic), bag.read_serialized(topic)
-            )
-            for topic in _list_wanted(bag, topics, clock)
-        ]
-
-
-def _list_wanted(bag: BagFile, topics: Sequence[str], clock: bool) -> list[str]:
-    names = [name if name.startswith("/") else f"/{name}" for name in topics]
-    for name in names:
-        if name not in bag.types:
-            raise RecordingError(
-                f"{bag.place}: has no topic {name!r}; {suggest(name, bag.types)}"
-            )
-    left_out = {*bag.empty, *([CLOCK] if clock else [])}
-    return [topic for topic in sorted(names or bag.types) if topic not in left_out]

@@ -58,7 +58,12 @@ class _Builder:
         moment = weigh_chassis(machine, self._physics)
         self._weigh(base, self._physics.mass, moment, machine.centre)
         if machine.castor is not None:
-            self._add_castor(base, *machine.castor)
+            behind, radius = machine.castor
+            joint, ball = skeleton.createBallJointAndBodyNodePair(base)
+            place = np.array([behind, 0.0, radius - machine.radius])
+            joint.setTransformFromParentBodyNode(scenery.make_transform(place))
+            self._weigh(ball, CASTOR_MASS, np.full(3, 0.4 * CASTOR_MASS * radius**2))
+            self._add_tread(ball, dartpy.dynamics.SphereShape(radius))
         for wheel in machine.wheels:
             self._add_wheel(base, wheel)
         joints = [skeleton.getJoint(joint) for joint in machine.joints]
@@ -83,17 +88,8 @@ class _Builder:
         joint.setName(name)
         body.setName(f"{name}_link")
         joint.setAxis(axis)
-        transform = scenery.make_transform(place)
-        joint.setTransformFromParentBodyNode(transform)
+        joint.setTransformFromParentBodyNode(scenery.make_transform(place))
         return body
-
-    def _add_castor(self, base: Any, behind: float, radius: float) -> None:
-        joint, body = base.getSkeleton().createBallJointAndBodyNodePair(base)
-        place = np.array([behind, 0.0, radius - self._machine.radius])
-        transform = scenery.make_transform(place)
-        joint.setTransformFromParentBodyNode(transform)
-        self._weigh(body, CASTOR_MASS, np.full(3, 0.4 * CASTOR_MASS * radius**2))
-        self._add_tread(body, dartpy.dynamics.SphereShape(radius))
 
     def _add_wheel(self, base: Any, wheel: Wheel) -> None:
         parent = base

@@ -12,13 +12,10 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.nodes.device_parameters import get_randomisation
 from nics_drl_bridge.nodes.runner import declare_rows, run_node
 from nics_drl_bridge.nodes.simulator_node import DeviceNode
-from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-
-def check(robot: RobotSpec) -> None:
-    """Raises ConfigError for a robot without a machine."""
-    design_machine(robot, PHYSICS, "DART")
+# Raises ConfigError for a robot without a machine.
+check = partial(design_machine, physics=PHYSICS, engine="DART")
 
 
 def dart_simulator(
@@ -31,9 +28,9 @@ def dart_simulator(
         model,
         world,
         robots,
-        replace(PHYSICS, **physics),
-        get_randomisation(node),
-        Path(file) if file else None,
+        physics=replace(PHYSICS, **physics),
+        randomisation=get_randomisation(node),
+        file=Path(file) if file else None,
     )
 
 

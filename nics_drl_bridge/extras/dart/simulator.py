@@ -23,12 +23,10 @@ from nics_drl_bridge.extras.physics.simulator import (
     Reading,
     ServoRig,
 )
-from nics_drl_bridge.generator import SimulatorModel, footprint_shape
+from nics_drl_bridge.generator import footprint_shape
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.sim.randomisation import Randomisation
-from nics_drl_bridge.sim.world_set import AnyWorld
 
 PHYSICS = Physics(timestep=0.002)
 GRAVITY = 9.81  # [m/s^2]
@@ -152,18 +150,11 @@ class DartSimulator(RayCastingSimulator):
     """One world of robots in DART; for `file` see DartRobot."""
 
     engine = "DART"
+    usual_physics = PHYSICS
 
-    def __init__(
-        self,
-        model: SimulatorModel,
-        world: AnyWorld,
-        robots: int = 1,
-        physics: Physics = PHYSICS,
-        randomisation: Randomisation | None = None,
-        file: Path | None = None,
-    ) -> None:
+    def __init__(self, *given: Any, file: Path | None = None, **options: Any) -> None:
         self._file = file
-        super().__init__(model, world, robots, physics, randomisation=randomisation)
+        super().__init__(*given, **options)
 
     def compile(self, bodies: Array) -> list[DartRig]:
         """See `PhysicsSimulator`."""

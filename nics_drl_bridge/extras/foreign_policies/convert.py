@@ -103,18 +103,6 @@ def _read_mapping(path: Path) -> ForeignNetwork:
     return ForeignNetwork(mapping, network, path, hash_bytes(content))
 
 
-def _check_period(foreign: ForeignNetwork, period: float) -> None:
-    """Raises PolicyError if a network was trained with another control period."""
-    trained = foreign.mapping.control_period or period
-    if abs(trained - period) > PERIOD_TOLERANCE:
-        reason = f"is {trained:g} s, but the robot's is {period:g} s"
-        raise PolicyError(
-            str(foreign.path),
-            "control_period",
-            f"{reason}; use a model with that period.",
-        )
-
-
 def _convert(foreign: ForeignNetwork, model: SimulatorModel | None) -> bytes:
     """Returns a policy file: the network, and its mapping in the contract."""
     mapping = foreign.mapping
@@ -124,7 +112,12 @@ def _convert(foreign: ForeignNetwork, model: SimulatorModel | None) -> bytes:
             fix = "add `robot:`, or name one with --model or --robot."
             raise ConfigError(f"{source}: names no robot; {fix}")
         model = open_model(mapping.robot)
-    _check_period(foreign, model.control_period)
+    period = model.control_period
+    trained = mapping.control_period or period
+    if abs(trained - period) > PERIOD_TOLERANCE:
+        reason = f"is {trained:g} s, but the robot's is {period:g} s"
+        fix = "use a model with that period."
+        raise PolicyError(source, "control_period", f"{reason}; {fix}")
     task = _make_task(mapping, model, source)
     network = _fix_shapes(foreign.model, mapping, task.scan_parts)
     del network.metadata_props[:]

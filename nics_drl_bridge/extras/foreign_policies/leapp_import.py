@@ -174,22 +174,15 @@ def read_bundle(path: Path) -> Bundle:
         pipeline,
         _find_tensors(description, "inputs", names, source),
         _find_tensors(description, "outputs", names, source),
-        _list_states(pipeline, names, starts),
+        {
+            names[target]: ForeignState(next=names[out], start=starts.get(target, 0.0))
+            for out, targets in pipeline.feedback_flow.items()
+            for target in targets
+        },
         _join(models, pipeline.data_flow, names, source),
         hash_bytes("".join(digests).encode()),
         restore_policy(next(iter(models.values()))) if len(models) == 1 else None,
     )
-
-
-def _list_states(
-    pipeline: Pipeline, names: dict[str, str], starts: dict[str, tuple[float, ...]]
-) -> dict[str, ForeignState]:
-    """Returns the states that a bundle feeds back, by the names of their inputs."""
-    return {
-        names[target]: ForeignState(next=names[out], start=starts.get(target, 0.0))
-        for out, targets in pipeline.feedback_flow.items()
-        for target in targets
-    }
 
 
 def _name_ends(pipeline: Pipeline) -> dict[str, str]:

@@ -29,9 +29,17 @@ MISFIT = 0.01  # maximum error of a wheel's angle due to the tie rod [rad]
 def write_mjcf(machine: Machine, physics: Physics) -> str:
     """Returns the MJCF of a machine; its body `base_link` has the only free joint."""
     skids = machine.kind == "skid_steer"
-    robot = _write_chassis(machine, physics)
+    half = " ".join(f"{0.5 * s:.6g}" for s in machine.size)
+    centre = " ".join(f"{c:.6g}" for c in machine.centre)
+    robot = f"""
+      <geom name="chassis" type="box" mass="{physics.mass}" pos="{centre}" size="{half}"/>"""
     if machine.castor is not None:
-        robot += _write_castor(machine.castor, machine.radius, physics)
+        behind, ball = machine.castor
+        robot += f"""
+      <body pos="{behind:.6g} 0 {ball - machine.radius:.6g}">
+        <joint type="ball" damping="{physics.bearing}"/>
+        <geom class="tread" type="sphere" size="{ball:.6g}" mass="0.03"/>
+      </body>"""
     robot += "".join(_write_wheel(wheel, machine, physics) for wheel in machine.wheels)
     if machine.kind == "ackermann":
         actuators = _write_car_actuators(machine, physics) + _write_tie_rod(machine)
@@ -66,28 +74,21 @@ def write_mjcf(machine: Machine, physics: Physics) -> str:
 """
 
 
-def _write_chassis(machine: Machine, physics: Physics) -> str:
-    half = " ".join(f"{0.5 * s:.6g}" for s in machine.size)
-    centre = " ".join(f"{c:.6g}" for c in machine.centre)
-    return f"""
-      <geom name="chassis" type="box" mass="{physics.mass}" pos="{centre}" size="{half}"/>"""
-
-
-def _write_castor(castor: tuple[float, float], radius: float, physics: Physics) -> str:
-    behind, ball = castor
-    return f"""
-      <body pos="{behind:.6g} 0 {ball - radius:.6g}">
-        <joint type="ball" damping="{physics.bearing}"/>
-        <geom class="tread" type="sphere" size="{ball:.6g}" mass="0.03"/>
-      </body>"""
-
-
 def _write_wheel(wheel: Wheel, machine: Machine, physics: Physics) -> str:
     x, y = wheel.place
+    radius = machine.radius
+    width = 0.4 * radius
+    damping = 0.0 if wheel.driven else physics.bearing
+    rotor = _compute_rotor(machine, physics) if wheel.driven else 0.0
     if wheel.lean:
         content = _write_rollers(wheel, machine, physics)
     else:
-        content = _write_tyre(wheel, machine, physics)
+        content = f"""
+        <joint name="{wheel.name}" axis="0 1 0" damping="{damping}" armature="{rotor:.8g}"/>
+        <geom type="cylinder" mass="{physics.wheel_mass}" size="{radius:.6g} {0.5 * width:.6g}"
+              zaxis="0 1 0"/>
+        <geom class="tread" type="ellipsoid" mass="0" zaxis="0 1 0"
+              size="{radius:.6g} {radius:.6g} {0.5 * width:.6g}"/>"""
     if wheel.steering:
         content = f"""
         <joint name="{wheel.steering}" axis="0 0 1" armature="1e-4"
@@ -98,19 +99,6 @@ def _write_wheel(wheel: Wheel, machine: Machine, physics: Physics) -> str:
     return f"""
       <body pos="{x:.6g} {y:.6g} 0">{content}
       </body>"""
-
-
-def _write_tyre(wheel: Wheel, machine: Machine, physics: Physics) -> str:
-    radius = machine.radius
-    width = 0.4 * radius
-    damping = 0.0 if wheel.driven else physics.bearing
-    rotor = _compute_rotor(machine, physics) if wheel.driven else 0.0
-    return f"""
-        <joint name="{wheel.name}" axis="0 1 0" damping="{damping}" armature="{rotor:.8g}"/>
-        <geom type="cylinder" mass="{physics.wheel_mass}" size="{radius:.6g} {0.5 * width:.6g}"
-              zaxis="0 1 0"/>
-        <geom class="tread" type="ellipsoid" mass="0" zaxis="0 1 0"
-              size="{radius:.6g} {radius:.6g} {0.5 * width:.6g}"/>"""
 
 
 def _write_rollers(wheel: Wheel, machine: Machine, physics: Physics) -> str:

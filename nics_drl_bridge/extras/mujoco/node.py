@@ -12,13 +12,10 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.nodes.device_parameters import get_randomisation
 from nics_drl_bridge.nodes.runner import declare_rows, run_node
 from nics_drl_bridge.nodes.simulator_node import DeviceNode, declare_renderer
-from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-
-def check(robot: RobotSpec) -> None:
-    """Raises ConfigError for a robot without a machine."""
-    design_machine(robot, PHYSICS, "MuJoCo")
+# Raises ConfigError for a robot without a machine.
+check = partial(design_machine, physics=PHYSICS, engine="MuJoCo")
 
 
 def mujoco_simulator(

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nics_drl_bridge import defaults, geometry
+from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.extras.mujoco import scenery
 from nics_drl_bridge.extras.mujoco.machines import write_mjcf
@@ -18,12 +18,9 @@ from nics_drl_bridge.extras.physics.simulator import (
     Reading,
     Rig,
 )
-from nics_drl_bridge.generator import SimulatorModel, footprint_shape
+from nics_drl_bridge.generator import footprint_shape
 from nics_drl_bridge.interface import Array
-from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.sim.randomisation import Randomisation
-from nics_drl_bridge.sim.world_set import AnyWorld
 
 PHYSICS = Physics()
 SETTLING_S = 0.5
@@ -152,17 +149,7 @@ class MujocoSimulator(PhysicsSimulator):
     """One world of robots in MuJoCo."""
 
     engine = "MuJoCo"
-
-    def __init__(
-        self,
-        model: SimulatorModel,
-        world: AnyWorld,
-        robots: int = 1,
-        renderer: Renderer = defaults.MUJOCO_RENDERER,
-        physics: Physics = PHYSICS,
-        randomisation: Randomisation | None = None,
-    ) -> None:
-        super().__init__(model, world, robots, physics, renderer, randomisation)
+    usual_physics = PHYSICS
 
     @cached_property
     def _rest(self) -> Array:
@@ -183,10 +170,10 @@ class MujocoSimulator(PhysicsSimulator):
             obstacles,
         )
         self._data = mujoco.MjData(compiled)
-        self._mocap = {
-            k: int(compiled.body(f"{scenery.OBSTACLE_NAME}{k}").mocapid[0])
-            for k in (each.number for each in obstacles if each.moves)
-        }
+        self._mocap = {}
+        for k in (each.number for each in obstacles if each.moves):
+            body = compiled.body(f"{scenery.OBSTACLE_NAME}{k}")
+            self._mocap[k] = int(body.mocapid[0])
         self._bumper_of = scenery.find_bumpers(compiled, robots)
         parts = self._machine, compiled, self._data, self._rest
         return [MujocoRig(spec, *parts, m) for m in range(robots)]

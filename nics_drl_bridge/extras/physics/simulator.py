@@ -189,16 +189,18 @@ class PhysicsSimulator(DrivenSimulator, ABC):
     """
 
     engine: str  # name of the engine
+    usual_physics: Physics
 
     def __init__(
         self,
         model: SimulatorModel,
         world: AnyWorld,
-        robots: int,
-        physics: Physics,
+        robots: int = 1,
         renderer: Renderer = defaults.MUJOCO_RENDERER,
+        physics: Physics | None = None,
         randomisation: Randomisation | None = None,
     ) -> None:
+        physics = physics or self.usual_physics
         self._subperiods, self._steps, timestep = divide(
             model.control_period, physics.timestep
         )
@@ -346,13 +348,10 @@ class PhysicsSimulator(DrivenSimulator, ABC):
         twists = self._twist(np.array(states)) * self._machine.calibrated
         if self._machine.gyro:
             rates = geometry.wrap_angle(now[1] - before[1]) / part_s
-            twists[:, 2] = rates + self._draw_gyro_errors()
+            noise = self._gyro_noise.standard_normal(len(self._rigs))
+            errors = self._physics.gyro_bias + self._physics.gyro_noise * noise
+            twists[:, 2] = rates + errors
         return np.asarray(twists)
-
-    def _draw_gyro_errors(self) -> Array:
-        physics = self._physics
-        noise = self._gyro_noise.standard_normal(len(self._rigs))
-        return physics.gyro_bias + physics.gyro_noise * noise
 
 
 class RayCastingSimulator(PhysicsSimulator):

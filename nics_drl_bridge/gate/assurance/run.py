@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -126,22 +126,17 @@ def drive_all(
 def read_rows(log: Path, trials: list[Trial]) -> tuple[list[Row], int]:
     """Returns the complete rows of a log and their size [bytes]."""
     *lines, _ = log.read_bytes().split(b"\n")
-    rows = list(_parse(log, lines, trials))
-    return rows, sum(len(line) + 1 for line in lines)
-
-
-def _parse(log: Path, lines: list[bytes], trials: list[Trial]) -> Iterator[Row]:
     left = set(trials)
+    rows = []
     for number, line in enumerate(lines, 1):
         try:
             row = json.loads(line)
             left.remove(_read_trial(row))
         except (ValueError, KeyError, TypeError):
-            raise ConfigError(
-                f"{log}: line {number} is not an episode of this run; choose another "
-                "--out."
-            ) from None
-        yield row
+            fault = f"line {number} is not an episode of this run"
+            raise ConfigError(f"{log}: {fault}; choose another --out.") from None
+        rows.append(row)
+    return rows, sum(len(line) + 1 for line in lines)
 
 
 def _read_trial(row: Row) -> Trial:

@@ -394,7 +394,7 @@ class PybulletSimulator(RayCastingSimulator):
         physics: Physics = PHYSICS,
         randomisation: Randomisation | None = None,
     ) -> None:
-        super().__init__(model, world, 1, physics, randomisation=randomisation)
+        super().__init__(model, world, physics=physics, randomisation=randomisation)
 
     def compile(self, bodies: Array) -> list[PybulletRig]:
         """See `PhysicsSimulator`."""

@@ -39,19 +39,22 @@ def test_a_log_of_other_episodes_is_refused_by_its_line(tmp_path, lines, number)
         runs.read_rows(log, TRIALS)
 
 
-def test_a_trial_that_gave_no_row_is_tried_again(tmp_path):
+def test_a_row_is_on_disk_before_the_next_trial_and_one_that_gave_none_is_tried_again(
+    tmp_path,
+):
     asked = []
-
-    def fail_at(failing):
-        def drive(trials):
-            asked.append(list(trials))
-            yield from (one._asdict() for one in trials if one != failing)
-
-        return drive
+    log = tmp_path / runs.FAULT_LOG
 
     def run(failing):
-        log = tmp_path / runs.FAULT_LOG
-        return runs.drive_all(log, TRIALS, fail_at(failing), lambda *_: None)
+        def drive(trials):
+            asked.append(list(trials))
+            for one in trials:
+                if one != failing:
+                    before = log.read_bytes().count(b"\n")
+                    yield one._asdict()
+                    assert log.read_bytes().count(b"\n") == before + 1
+
+        return runs.drive_all(log, TRIALS, drive, lambda *_: None)
 
     assert run(failing=TRIALS[1]) == [
         one._asdict() for one in TRIALS if one != TRIALS[1]
