@@ -90,14 +90,6 @@ def check_unit(name: str) -> str:
     return str(name)
 
 
-def to_si(unit: str, ticks_per_turn: float | None) -> UnitOfData:
-    """Returns the SI unit and the factor of a unit; ticks are angles if their count is known."""
-    si = UNITS[unit].si
-    if si in TICKS and ticks_per_turn:
-        return UnitOfData(TICKS[si], TURN / ticks_per_turn)
-    return UNITS[unit]
-
-
 # Words of columns that can't be commands: positions on Earth, and uncertainties
 PLACES_ON_EARTH = word_set("latitude longitude altitude")
 SHORT_OF_EARTH = word_set("lat lon lng long")

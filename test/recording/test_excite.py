@@ -1,15 +1,10 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import DIRECT
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.identify.fit import (
-    list_commands_together,
-    list_unmoved_variables,
-)
+from nics_drl_bridge.identify.fit import list_commands_together, list_unmoved_variables
 from nics_drl_bridge.recording.excite import (
     PERIOD_S,
     STILL_S,
@@ -42,16 +37,10 @@ def preview(robot, speed=1.0) -> Pattern:
 
 @pytest.mark.slow
 @robots
-def test_the_whole_robot_keeps_within_its_circle(robot):
+def test_the_whole_robot_keeps_within_its_circle_and_rests_at_both_ends(robot):
     pattern = preview(robot)
     away = np.hypot(*pattern.pose[:, :2].T) + robot.footprint_radius
     assert 0.8 < away.max() <= 2.0
-
-
-@pytest.mark.slow
-@robots
-def test_it_begins_and_ends_at_rest(robot):
-    pattern = preview(robot)
     assert len(pattern.command) == 30.0 / PERIOD_S
     assert (pattern.command[:STILL] == 0.0).all()
     assert np.abs(pattern.command[-STILL:]).max() < 1e-12

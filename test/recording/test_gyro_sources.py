@@ -1,7 +1,5 @@
 """A gyro is found in bags and tables, and it is told what measured the pose."""
 
-from __future__ import annotations
-
 import bags
 import numpy as np
 import pytest

@@ -1,15 +1,10 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from nics_drl_bridge.config import dump_yaml, parse_yaml
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.mapping import load_mapping
-from nics_drl_bridge.recording.readers import (
-    open_drive,
-    reorder_variables,
-)
+from nics_drl_bridge.recording.readers import open_drive, reorder_variables
 from nics_drl_bridge.recording.recording import save_recording
 from nics_drl_bridge.robot.spec import load_robot
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -20,50 +18,47 @@ def test_a_clock_that_overflows_is_continued(size):
     assert "once" in note
 
 
-def test_a_clock_that_is_set_back_by_any_time_is_no_overflow():
-    t = np.concatenate([T[:150], T[150:] - 3.0])
-    assert stamping.remove_overflow(t, "log") == (pytest.approx(t), "")
+ROWS = np.arange(300)
+LATE = ROWS.copy()
+LATE[[100, 102]] = 102, 100
 
 
-def test_few_late_rows_are_sorted():
-    order = np.arange(300)
-    order[[100, 102]] = order[[102, 100]]
-    t, rows, note = stamping.repair_order(T[order], "log")
-    assert np.array_equal(t, T)
-    assert np.array_equal(rows, order)
-    assert "2 of 300 rows came after later ones" in note
-
-
-def test_parts_after_a_clock_was_set_back_are_joined():
-    t, rows, note = stamping.repair_order(
-        np.concatenate([T[:100], T[:200] - 99.0]), "log"
-    )
-    assert np.allclose(np.diff(t), 0.02)
-    assert np.array_equal(rows, np.arange(300))
-    assert "set back once (row 100, by 101 s)" in note
-
-
-@pytest.mark.parametrize(("row", "value"), [(150, 0.0), (150, 1e9), (0, 1e9)])
-def test_a_stamp_that_fits_none_beside_it_is_left_out(row, value):
+def stray(row, value):
+    """A stamp that fits none beside it."""
     t = T.copy()
     t[row] = value
-    made, rows, note = stamping.repair_order(t, "log")
-    assert np.array_equal(made, np.delete(T, row))
-    assert row not in rows
-    assert f"1 stamps do not fit their neighbours (row {row}: {value:.10g} s)" in note
+    note = f"1 stamps do not fit their neighbours (row {row}: {value:.10g} s)"
+    return t, np.delete(ROWS, row), note
 
 
-def test_rows_that_begin_with_the_last_are_turned_round():
-    t, rows, note = stamping.repair_order(T[::-1], "log")
-    assert np.array_equal(t, T)
-    assert rows[0] == 299
-    assert "were reversed" in note
+# Stamps; the rows in order, and the note.
+REPAIRS = {
+    "late": (T[LATE], LATE, "2 of 300 rows came after later ones"),
+    "set back": (
+        np.append(T[:100], T[:200] - 99.0),
+        ROWS,
+        "set back once (row 100, by 101 s)",
+    ),
+    "set ahead": (
+        np.append(T[:100], T[100:] + 1.7e9),
+        ROWS,
+        "set ahead once (row 100, by 1.7e+09 s)",
+    ),
+    "reversed": (T[::-1], ROWS[::-1], "were reversed"),
+    "early": stray(150, 0.0),
+    "far ahead": stray(150, 1e9),
+    "first": stray(0, 1e9),
+}
 
 
-def test_a_clock_that_was_set_ahead_by_years_goes_on():
-    t, _, note = stamping.repair_order(np.append(T[:100], T[100:] + 1.7e9), "log")
-    assert np.allclose(np.diff(t), 0.02, atol=1e-6)
-    assert "set ahead once (row 100, by 1.7e+09 s)" in note
+@pytest.mark.parametrize("case", REPAIRS)
+def test_the_order_of_stamps_is_repaired_and_the_repair_is_told(case):
+    given, order, note = REPAIRS[case]
+    t, rows, told = stamping.repair_order(given, "log")
+    whole = T[np.sort(order)]
+    assert np.allclose(t, whole, rtol=0.0, atol=1e-6)
+    assert np.array_equal(rows, order)
+    assert note in told
 
 
 def test_rows_that_repeat_stamp_and_values_are_left_out():
