@@ -15,13 +15,12 @@ import numpy as np
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, find_table_axis
-from nics_drl_bridge.recording.mapping import NO_COMMANDS, UNITS
-from nics_drl_bridge.recording.names import word_set
+from nics_drl_bridge.recording.mapping import NO_COMMANDS, UNITS, word_set
 from nics_drl_bridge.recording.survey import TICKS, Field, TableSurvey, split_unit
 from nics_drl_bridge.recording.table import Column, is_text
 from nics_drl_bridge.recording.values import match_values
 from nics_drl_bridge.robot.spec import find_kind, list_kinds
-from nics_drl_bridge.robot.template import list_names
+from nics_drl_bridge.robot.template import Template, list_names
 
 # Words of the first coordinate, with the matching word of the second
 COORDINATES = {
@@ -169,7 +168,7 @@ FORMS_OF_TURN = (
 # A command's meaning by its name, with a word from each of these sets; the first row counts
 MEANINGS: tuple[tuple[str | None, tuple[frozenset[str], ...]], ...] = (
     *((corner, (short,)) for corner, short, _, _ in CORNERS),
-    *((corner, sides) for corner, _, *sides in CORNERS),
+    *((corner, (along, across)) for corner, _, along, across in CORNERS),
     (None, (LEFT, RIGHT)),
     ("left", (LEFT,)),
     ("right", (RIGHT,)),
@@ -495,14 +494,14 @@ def guess_command(
     for table in tables:
         candidates += _find_candidates(table, pose)
     candidates = _accept_steering(candidates)
-    certain = [column for column in candidates if column.strength >= LIKELY]
+    certain = [each for each in candidates if each.strength >= LIKELY]
     kind, commands = _choose_kind(certain)
     if kind is not None:
         return CommandGuess(kind, commands, {})
     if not certain:
         kind, commands = _choose_kind(list(_find_wheels(tables)))
         if kind is not None:
-            wheels = [wheel.column for wheel in commands.values()]
+            wheels = [each.column for each in commands.values()]
             others = [each for each in candidates if each.column not in wheels]
             named = _choose_kind(others)[1]
             return CommandGuess(kind, commands, named, of_wheels=True)
@@ -512,8 +511,8 @@ def guess_command(
     kind, named = _choose_kind(candidates)
     if kind is None:
         candidates.sort(key=lambda column: -column.strength)
-        for k, candidate in enumerate(candidates[:MOST_CANDIDATES]):
-            named[f"command_{k}"] = candidate
+        for k, each in enumerate(candidates[:MOST_CANDIDATES]):
+            named[f"command_{k}"] = each
     return CommandGuess(kind, {}, named)
 
 
@@ -617,8 +616,8 @@ def _choose_kind(
     """Returns the kind of robot that these columns drive best, and its commands by name."""
     best: tuple[str | None, dict[str, Candidate]] = (None, {})
     best_merit = (0, 0)
-    templates = ((name, find_kind(name).template.words) for name in list_kinds())
-    for name, words in (*templates, *KINDS):
+    kinds = ((name, template.words) for name, template in _list_templates().items())
+    for name, words in (*kinds, *KINDS):
         commands = _match_commands(words, candidates)
         still = sum(command.is_still for command in commands.values())
         if still < len(commands):
@@ -629,6 +628,11 @@ def _choose_kind(
     return best
 
 
+def _list_templates() -> dict[str, Template]:
+    kinds = {name: find_kind(name) for name in list_kinds()}
+    return {name: kind.template for name, kind in kinds.items() if kind is not None}
+
+
 def _match_commands(
     names: Mapping[str, str], candidates: Sequence[Candidate]
 ) -> dict[str, Candidate]:
@@ -636,12 +640,11 @@ def _match_commands(
     commands: dict[str, Candidate] = {}
     for meaning, name in names.items():
         fitting = [column for column in candidates if column.meaning == meaning]
-        merit = max((column.merit for column in fitting), default=None)
-        best, *rivals = [c for c in fitting if c.merit == merit] or [None]
-        values = [rival.column.values for rival in rivals]
-        if best is None or not all(
-            np.array_equal(best.column.values, v) for v in values
-        ):
+        if not fitting:
+            return {}
+        best = max(fitting, key=lambda column: column.merit)
+        values = [c.column.values for c in fitting if c.merit == best.merit]
+        if not all(np.array_equal(best.column.values, others) for others in values):
             return {}
         commands[name] = best
     return commands
@@ -663,7 +666,9 @@ def _find_wheels(tables: Sequence[TableSurvey]) -> Iterator[Candidate]:
 
 def find_look_alikes(name: str) -> list[str]:
     """Returns the other kinds of robots that have the same commands."""
-    kinds = {kind: find_kind(kind).template.commands for kind in list_kinds()}
-    sets = {kind: [{*list_names(c)} for c in forms] for kind, forms in kinds.items()}
+    sets = {
+        kind: [{*list_names(commands)} for commands in template.commands]
+        for kind, template in _list_templates().items()
+    }
     names = sets.pop(name, [])
     return [kind for kind, others in sets.items() if any(o in names for o in others)]

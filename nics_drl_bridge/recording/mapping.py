@@ -1,6 +1,7 @@
 """DriveMapping: which column or message field of a recording is which stream, and in what unit."""
 
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -8,7 +9,6 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, load_yaml
 from nics_drl_bridge.errors import suggest
-from nics_drl_bridge.recording.names import split_words, word_set
 
 TURN = 2.0 * math.pi
 
@@ -81,6 +81,24 @@ RATES = {
     "m/s": "m/s^2",
     "rad/s": "rad/s^2",
 }
+
+
+def word_set(text: str) -> frozenset[str]:
+    """Returns the words of a text, split at white space."""
+    return frozenset(text.split())
+
+
+def split_words(name: str) -> list[str]:
+    """Splits a name into its words: `vicon x`, `q.x`, `Left_Tick`, `cmdVel`."""
+    parts = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
+    return [word for word in re.split(r"[^A-Za-z]+", parts.lower()) if word]
+
+
+def write_reference(reference: str) -> str:
+    """Returns a reference as YAML that is also valid within a list."""
+    plain = re.fullmatch(r"[A-Za-z/][\w/. -]*(:[\w. -]+)?|\d+", reference)
+    is_word = reference.lower() not in ("true", "false", "null")
+    return reference if plain and is_word else f'"{reference}"'
 
 
 def check_unit(name: str) -> str:

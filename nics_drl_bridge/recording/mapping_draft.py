@@ -23,8 +23,7 @@ from nics_drl_bridge.recording.column_guesses import (
     write_value,
 )
 from nics_drl_bridge.recording.mapped import POSES
-from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.names import write_reference
+from nics_drl_bridge.recording.mapping import UNITS, write_reference
 from nics_drl_bridge.recording.recording import (
     Implausible,
     compute_heading,
@@ -66,7 +65,8 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
     pose = guess_pose(tables)
     guess = guess_command(tables, pose)
     switches = guess_switches(tables) if guess.listed else ()
-    used = [each.column for each in (*guess.listed.values(), *switches)]
+    used = [candidate.column for candidate in guess.listed.values()]
+    used += [switch.column for switch in switches]
     gyro = guess_yaw_rate(tables)
     if gyro in used:
         gyro = None
@@ -258,6 +258,7 @@ def _find_fault(
     values = np.stack([*place, heading], axis=1)
     is_finite = np.isfinite(values).all(axis=1)
     # A car may accelerate harder than a small robot; only the kind distinguishes them.
-    may_be_car = kind is None or kind.startswith("ackermann")
-    radius = np.inf if may_be_car else USUAL_RADIUS
+    radius = USUAL_RADIUS
+    if kind is None or kind.startswith("ackermann"):
+        radius = np.inf
     return find_implausible_pose(t[is_finite], values[is_finite], radius=radius)

@@ -178,10 +178,10 @@ def read_joint_streams(
     plain = []
     for message in messages:
         joints = message.content  # of rclpy or rosbags
-        position = np.array(joints.position)
-        velocity = np.array(joints.velocity)
         copy = SimpleNamespace(
-            name=list(joints.name), position=position, velocity=velocity
+            name=list(joints.name),
+            position=np.array(joints.position),
+            velocity=np.array(joints.velocity),
         )
         plain.append(Message(message.receive_ns, copy))
     table = make_message_table(f"{place}: topic {topic!r}", plain)

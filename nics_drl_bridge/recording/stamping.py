@@ -1,7 +1,5 @@
 """Stamps: clocks of topics, by headers or receipt, and repairs of stamps and counters."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
@@ -81,7 +79,7 @@ class TopicData:
     header_ns: Nanoseconds | None
     values: Array  # (T, D)
 
-    def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> TopicData:
+    def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> "TopicData":
         """Returns the messages selected by `keep`, a mask (T,) or indices."""
         header_ns = self.header_ns
         if header_ns is not None:
@@ -105,7 +103,8 @@ def stamp_streams(
     headers: dict[str, Nanoseconds | None] = dict.fromkeys(data)
     if stamps != "receive":
         data = {name: _sort_by_stamp(part, place) for name, part in data.items()}
-        headers = {n: _check_header(part, stamps, place) for n, part in data.items()}
+        for name, part in data.items():
+            headers[name] = _check_header(part, stamps, place)
     origin = min(int(part.receive_ns.min()) for part in data.values())
     clocks = dict.fromkeys(data, (RECEIVE, 0))
     if stamps == "header":
@@ -203,7 +202,7 @@ def _make_error(place: str, topic: str, fault: str, advice: str) -> RecordingErr
     return RecordingError(f"{place}: {reason}; {advice}.", reason)
 
 
-def _sort_by_stamp(part: TopicData, place: str) -> TopicData:
+def _sort_by_stamp(part: TopicData, place: str) -> "TopicData":
     """Drops unstamped messages at the start, and sorts the few late ones by stamp."""
     ns = part.header_ns
     if ns is None or not ns.any():

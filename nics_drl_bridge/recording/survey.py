@@ -11,8 +11,13 @@ import numpy as np
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording import stamping
-from nics_drl_bridge.recording.mapping import UNITS, is_place_on_earth
-from nics_drl_bridge.recording.names import split_words, word_set, write_reference
+from nics_drl_bridge.recording.mapping import (
+    UNITS,
+    is_place_on_earth,
+    split_words,
+    word_set,
+    write_reference,
+)
 from nics_drl_bridge.recording.recording import (
     IRREGULAR,
     UNITS_OF_STEP,

@@ -321,8 +321,9 @@ def _compare_turns(facts: Facts) -> Turning | None:
         series += [(ns - stamps[0]) * S_PER_NS, np.array(values)[rows]]
     if not all(np.isfinite(column).all() for column in series):
         return None
+    odom_t, poses, gyro_t, rates = series
     for window_s in (WINDOW_S, SHORT_WINDOW_S):
-        turning = compare_turning(*series, window_s)
+        turning = compare_turning(odom_t, poses, gyro_t, rates, window_s)
         if turning is not None and turning.compared:
             return turning
     return None
@@ -358,7 +359,8 @@ def _check_odometry(facts: Facts, robot: RobotSpec) -> Findings:
 
 
 def _check_moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Findings:
-    dt = np.diff(facts.heard[ODOM].stamps_ns) * S_PER_NS
+    stamps = np.array(facts.heard[ODOM].stamps_ns, dtype=np.int64)
+    dt = np.diff(stamps) * S_PER_NS
     going = dt > 0.0
     if going.sum() < LEAST_STEPS:
         return

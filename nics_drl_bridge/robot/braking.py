@@ -511,8 +511,8 @@ def _fit_tightest(
     reaction, inverse = result.x
     slack = float(cost @ result.x - (worst * weight).mean())
     # The solver meets each bound up to its tolerance.
-    missing = float((times - reaction - pace * inverse).max())
-    return _Fit(slack, float(reaction) + max(missing, 0.0), float(inverse))
+    reaction += max((times - reaction - pace * inverse).max(), 0.0)
+    return _Fit(slack, float(reaction), float(inverse))
 
 
 def fit_separate_bounds(stops: Stops, radius: float) -> Braking | None:
