@@ -11,7 +11,8 @@ from nics_drl_bridge.recording.excite import (
     DrivePlan,
     Exploration,
     Pattern,
-    predict_motion,
+    find_motion,
+    predict,
 )
 from nics_drl_bridge.recording.recording import samples_on_one_clock
 from nics_drl_bridge.recording.textbook import record
@@ -81,13 +82,13 @@ def test_every_command_is_moved_by_the_rules_that_a_fit_judges_a_drive_by(robot)
 def drive_another(robot, really, gain, seed):
     """Greatest distance of a robot that moves otherwise than expected, and is watched."""
     drive = DrivePlan(robot, bound=2.0, duration=20.0, seed=seed).begin()
-    motion = predict_motion(really)
+    motion = find_motion(really)
     pose = np.zeros((1, 3))
-    state = np.zeros((1, motion.size))
+    state = np.zeros((1, len(motion.lag)))
     away = 0.0
     while not drive.done:
         command = gain * drive.choose_command()
-        poses, states = motion.predict(pose, state, command[None, None], PERIOD_S)
+        poses, states = predict(motion, pose, state, command[None, None], PERIOD_S)
         pose = poses[:, -1]
         state = states[:, -1]
         drive.observe(pose[0])
@@ -199,7 +200,7 @@ def test_it_is_the_textbook_but_for_a_centimetre(name):
     drive = record(spec, np.random.default_rng(0), 4.0, PERIOD_S, hold=0.4)
     start = np.zeros((1, 3)), np.zeros((1, len(spec.state)))
     command = drive.command.values[None]
-    poses, states = predict_motion(spec).predict(*start, command, PERIOD_S)
+    poses, states = predict(find_motion(spec), *start, command, PERIOD_S)
     assert poses.shape == (1, 81, 3)
     assert states[0, :-1] == pytest.approx(drive.state.values)
     off = poses[0, :-1] - drive.pose.values
@@ -207,14 +208,11 @@ def test_it_is_the_textbook_but_for_a_centimetre(name):
 
 
 def test_without_a_textbook_cmd_vel_is_the_twist():
-    poses, states = predict_motion(DIRECT).predict(
-        np.zeros((1, 3)),
-        np.zeros((1, 0)),
-        np.tile([1.0, -0.5, 0.0], (1, 20, 1)),
-        PERIOD_S,
-    )
+    commands = np.tile([1.0, -0.5, 0.0], (1, 20, 1))
+    rest = np.zeros((1, 3))
+    poses, states = predict(find_motion(DIRECT), rest, rest, commands, PERIOD_S)
     assert poses[0, -1] == pytest.approx([1.0, -0.5, 0.0])
-    assert states.shape == (1, 21, 0)
+    assert states.shape == (1, 21, 3)
 
 
 def test_a_steering_angle_without_a_textbook_can_not_be_predicted():
@@ -222,4 +220,4 @@ def test_a_steering_angle_without_a_textbook_can_not_be_predicted():
     with pytest.raises(
         ConfigError, match=r"'steering_command' in rad.*add `textbook:`"
     ):
-        predict_motion(car)
+        find_motion(car)

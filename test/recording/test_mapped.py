@@ -351,3 +351,19 @@ def test_a_unit_of_another_kind_than_the_command_s_is_refused(log, unit, says):
     with pytest.raises(ConfigError, match=says):
         open_drive(path, None, change_map(changes % unit))
     open_drive(path, None, change_map(changes % f"{unit}, scale: 0.5"))
+
+
+POSE = "pose: {x: odom_x, y: odom_y, heading: odom_yaw%s}\n"
+
+
+@pytest.mark.parametrize(
+    ("key", "measured_by"), [("", "odometry"), (", measured_by: tracker", "tracker")]
+)
+def test_a_second_heading_column_is_a_turn_rate(log, columns, key, measured_by):
+    odometry = {f"odom_{name}": columns[name] for name in ("x", "y", "yaw")}
+    second = {"second": np.degrees(columns["yaw"] * 30.0) % 360.0}
+    path = log(odometry | second)
+    changes = f"{POSE % key}imu: {{heading: {{from: second, unit: deg}}}}"
+    found = read(path, changes)
+    assert found.imu.values[:, 2] == pytest.approx(0.25 * 30.0, abs=1e-3)
+    assert found.measured_by == measured_by  # by the names, unless the mapping says it

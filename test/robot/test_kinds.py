@@ -11,7 +11,6 @@ from robots import lidar
 from nics_drl_bridge import extensions
 from nics_drl_bridge.config import validate
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.task import discrete_commands
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import generate
@@ -216,17 +215,6 @@ def test_a_free_robot_reaches_goals_by_its_model_and_not_without():
         observation, _ = env.reset(seed=0)
         with pytest.raises(ConfigError, match="has no textbook kinematics"):
             make_policy(name, env.task).act(observation)
-
-
-def test_their_discrete_actions_drive_ahead_and_turn():
-    wheels = discrete_commands(made("differential_wheels"))
-    assert wheels[1:4] == pytest.approx(
-        np.array([[10.0, 10.0], [0.0, 10.0], [10.0, 0.0]])
-    )
-    car = discrete_commands(made("ackermann_throttle"))
-    assert car[1:4] == pytest.approx(np.array([[1.0, 0.0], [1.0, 1.0], [1.0, -1.0]]))
-    free = build_robot({"kind": "free", "footprint_radius": 0.2}, {"pump": (0.0, 1.0)})
-    assert discrete_commands(free).tolist() == [[0.0], [1.0], [0.0]]
 
 
 def test_a_front_wheel_across_turns_a_tricycle_about_its_rear_axle():
