@@ -83,19 +83,20 @@ MODES = ENABLING | word_set("mode state status safety switch")
 EPISODES = word_set("episode ep trial traj trajectory rollout run")
 MIN_MEAN_EPISODE_ROWS = 20  # minimum number of rows of an episode, on average
 OF_MESSAGE = "angular_velocity.z"  # a field of sensor_msgs/Imu
-TURNING_OF_IMU = (
-    {"gyro", "z"},
-    {"gz"},
-    {"gyroz"},
-    {"gyro", "yaw"},
-    {"yaw", "rate"},
-    {"yawrate"},
-    {"w"},
-    {"wz"},
-    {"omega"},
-    {"angular", "z"},
-    {"z", "rate"},
-)
+NAMES_OF_YAW_RATE = """
+    gyro z
+    gz
+    gyroz
+    gyro yaw
+    yaw rate
+    yawrate
+    w
+    wz
+    omega
+    angular z
+    z rate
+"""
+TURNING_OF_IMU = [word_set(line) for line in NAMES_OF_YAW_RATE.strip().splitlines()]
 NOT_OF_GYRO = word_set("""
     cmd command commanded ref setpoint target desired covariance
     odom odometry vicon mocap gt truth
