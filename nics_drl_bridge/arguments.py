@@ -133,7 +133,10 @@ def rename_robot_argument(
     value_by_word = named.get(word, positional)
     if value is None:
         return
-    if value_by_word is not None and not _is_same(value_by_word, value):
+    is_same = value_by_word is value or (
+        isinstance(value_by_word, str | PathLike) and str(value_by_word) == str(value)
+    )
+    if value_by_word is not None and not is_same:
         values = (
             f"{word}={format_value(value_by_word)} and {synonym}={format_value(value)}"
         )
@@ -143,12 +146,6 @@ def rename_robot_argument(
         )
     if positional is None:
         named[word] = value
-
-
-def _is_same(first: Any, second: Any) -> bool:
-    return first is second or (
-        isinstance(first, str | PathLike) and str(first) == str(second)
-    )
 
 
 def check_arguments(

@@ -8,6 +8,7 @@ import os
 import re
 import secrets
 import shutil
+import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -351,6 +352,16 @@ def read_file(path: Path) -> bytes:
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"it is larger than {MOST_BYTES // 2**20} MB")
     return path.read_bytes()
+
+
+def count_unpacked(file: BinaryIO) -> int:
+    """Returns the size of a zip archive's members when unpacked [bytes]; 0 for other files."""
+    size = 0
+    if zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+    file.seek(0)
+    return size
 
 
 def names_in_sums(folder: Path) -> set[str]:

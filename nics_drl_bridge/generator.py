@@ -387,18 +387,8 @@ def load_model(folder: str | Path) -> SimulatorModel:
     if folder.stat().st_ino != inode:
         raise ModelError(f"{folder}: was replaced while it was read; open it again.")
     try:
-        return SimulatorModel(
-            file.robot,
-            file.kinematics.model(),
-            file.calibration,
-            file.lidar,
-            table,
-            file.noise,
-            file.control_period,
-            report,
-            file.latency,
-            file.sensors,
-            file.gyro,
-        )
+        parts = vars(file) | {"kinematics": file.kinematics.model()}
+        del parts["format"]
+        return SimulatorModel(**parts, table=table, report=report)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None

@@ -1,7 +1,7 @@
 """The style of all pictures: fonts, and the colours of Okabe and Ito for the colour-blind."""
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from textwrap import fill
 from typing import Any, Literal, NamedTuple
@@ -93,13 +93,6 @@ def make_panels(
     )
 
 
-def _count_legend_columns(labels: Sequence[str], width: float) -> int:
-    """Returns the number of columns of a legend that fits into a width [inch]."""
-    letters = LETTERS_PER_IN * width
-    widths = [len(label) + 5 for label in labels]
-    return len(labels) if sum(widths) <= letters else max(1, int(letters / max(widths)))
-
-
 def _compute_width(panel: Panel, columns: int = 1) -> float:
     """Returns the width [inch] of a figure whose panels have a fixed size."""
     return columns * (panel.left + panel.width + RIGHT_IN)
@@ -107,9 +100,7 @@ def _compute_width(panel: Panel, columns: int = 1) -> float:
 
 @apply_style()
 def render_png(
-    figure: Figure,
-    legend: Axes | None = None,
-    panel: Panel | None = None,
+    figure: Figure, legend: Axes | None = None, panel: Panel | None = None
 ) -> bytes:
     """Renders a figure as a PNG, with empty axes hidden and the legend of one of the axes on top.
 
@@ -159,7 +150,11 @@ def _add_legend(figure: Figure, source: Axes, place: LegendPlace) -> int:
     handles, labels = source.get_legend_handles_labels()
     if not labels:
         return 0
-    columns = _count_legend_columns(labels, figure.get_figwidth())
+    columns = len(labels)
+    letters = LETTERS_PER_IN * figure.get_figwidth()
+    widths = [len(label) + 5 for label in labels]
+    if sum(widths) > letters:
+        columns = max(1, int(letters / max(widths)))
     figure.legend(handles, labels, loc=place, ncols=columns)
     return -(-len(labels) // columns)
 

@@ -1,13 +1,8 @@
 """What may be wrong with a file, whatever it is of."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path
-
-DEEP = 10_000
-LARGE = 2_000_000
 
 
 def _folder(path: Path) -> None:
@@ -50,41 +45,16 @@ FILES: dict[str, Callable[[Path], object]] = {
 
 TEXTS: dict[str, Callable[[Path], object]] = {
     "Latin-1": _text(lambda whole: whole + "\n# größer\n".encode("latin-1")),
-    "deeply nested in brackets": _text(lambda _: b"a: " + b"[" * DEEP + b"]" * DEEP),
-    "deeply nested in braces": _text(lambda _: b"a: " + b"{b: " * DEEP + b"}" * DEEP),
-    "deeply indented": _text(
-        lambda _: (
-            b"".join(b" " * n + b"a:\n" for n in range(200)) + b" " * 200 + b"a: 1\n"
-        )
-    ),
-    "a list": _text(lambda _: b"- 1\n- 2\n"),
-    "one word": _text(lambda _: b"word\n"),
     "a tab": _text(lambda whole: b"a:\n\tb: 1\n" + whole),
-    "an alias bomb": _text(
-        lambda _: (
-            b"a: &a [1,1,1,1,1,1,1,1,1]\n"
-            + b"".join(
-                b"%c: &%c [" % (k, k) + b",".join([b"*%c" % (k - 1)] * 9) + b"]\n"
-                for k in range(ord("b"), ord("j"))
-            )
-        )
-    ),
-    "an object of Python": _text(
-        lambda _: b"a: !!python/object/apply:os.system ['true']\n"
-    ),
     "two documents": _text(lambda whole: whole + b"\n---\n" + whole),
     "an unknown key": _text(lambda whole: whole.rstrip() + b"\nunheard_of: 1\n"),
-    "a very long line": _text(
-        lambda whole: whole.rstrip() + b"\nlong: " + b"x" * LARGE + b"\n"
-    ),
     "an unclosed quote": _text(lambda whole: whole + b'\nb: "never\n'),
-    "an alias of itself": _text(lambda _: b"a: &a [*a]\n"),
     "a merge of nothing": _text(lambda whole: whole.rstrip() + b"\n<<: 3\n"),
     "a date": _text(lambda whole: whole.rstrip() + b"\nsince: 2020-99-99\n"),
     "a surrogate": _text(lambda whole: whole.rstrip() + b'\ns: "\\uD800"\n'),
     "control characters": _text(lambda whole: whole.rstrip() + b"\ns: \x01\x02\n"),
 }
-"""Of YAML files."""
+"""Of YAML files, besides what `test_config` reads."""
 
 VALUES = (
     "word",

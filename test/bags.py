@@ -1,7 +1,5 @@
 """Bags for tests: messages of any kind, as a robot's own recorder would write them."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 from collections.abc import Callable, Iterable, Sequence

@@ -23,12 +23,12 @@ def drive(
 
 
 @pytest.mark.parametrize("word", ["robot", "model"])
-def test_either_word_names_the_robot(word: str) -> None:
+def test_either_word_names_the_robot(word: str):
     assert drive(**{word: "jackal"})[0] == "jackal"
 
 
 @pytest.mark.parametrize("first", [{"model": "ackermann"}, {}])
-def test_two_words_for_two_robots_are_refused(first: dict[str, Any]) -> None:
+def test_two_words_for_two_robots_are_refused(first: dict[str, Any]):
     given = () if first else ("ackermann",)
     with pytest.raises(
         ConfigError, match=r"model='ackermann' and robot='jackal'.*give one"
@@ -36,7 +36,7 @@ def test_two_words_for_two_robots_are_refused(first: dict[str, Any]) -> None:
         drive(*given, robot="jackal", **first)  # type: ignore[call-arg]
 
 
-def test_an_unknown_keyword_is_told_with_the_nearest_one() -> None:
+def test_an_unknown_keyword_is_told_with_the_nearest_one():
     with pytest.raises(
         ConfigError, match="drive: unknown argument 'metre'; did you mean 'metres'"
     ):
@@ -44,12 +44,12 @@ def test_an_unknown_keyword_is_told_with_the_nearest_one() -> None:
 
 
 @pytest.mark.parametrize("value", [None, "1", [1.0], float("nan"), float("inf"), True])
-def test_a_value_that_is_no_number_is_refused(value: Any) -> None:
+def test_a_value_that_is_no_number_is_refused(value: Any):
     with pytest.raises(ConfigError, match=r"drive: metres=.*must be a finite number"):
         drive(metres=value)
 
 
-def test_a_value_that_may_be_none_is_accepted_as_none() -> None:
+def test_a_value_that_may_be_none_is_accepted_as_none():
     assert drive(turns=None)[2] is None
     with pytest.raises(
         ConfigError, match=r"turns=1\.5: must be a whole number, or None"
@@ -58,13 +58,13 @@ def test_a_value_that_may_be_none_is_accepted_as_none() -> None:
 
 
 @pytest.mark.parametrize("value", [0, -1, 1.5, True, None, "3", float("nan"), 2**31])
-def test_a_count_is_a_whole_number_of_at_least_one(value: Any) -> None:
+def test_a_count_is_a_whole_number_of_at_least_one(value: Any):
     with pytest.raises(ConfigError, match="must be a whole number"):
         check_count("num_envs", value)
 
 
 @pytest.mark.parametrize("value", [3, None, True, ["a"], "a\0b"])
-def test_a_path_is_text_or_a_path(value: Any) -> None:
+def test_a_path_is_text_or_a_path(value: Any):
     with pytest.raises(ConfigError, match="path"):
         check_path("folder", value)
 
@@ -74,13 +74,11 @@ OPENERS = ("model", "policy", "recording", "robot", "world", "worlds")
 
 @pytest.mark.parametrize("value", [3, None, [], True, {}, object(), "a\0b"])
 @pytest.mark.parametrize("name", OPENERS)
-def test_what_is_no_path_is_refused_by_all_that_opens_one(
-    name: str, value: Any
-) -> None:
+def test_what_is_no_path_is_refused_by_all_that_opens_one(name: str, value: Any):
     with pytest.raises(BridgeError) as caught:
         getattr(nics_drl_bridge, f"load_{name}")(value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_large_object_is_quoted_by_its_type() -> None:
+def test_a_large_object_is_quoted_by_its_type():
     assert format_value([1.0] * 1000) == "of type list"

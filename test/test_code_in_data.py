@@ -1,7 +1,5 @@
 """No file of data runs code: it names what is installed, and a path to code is only looked at."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import sys

@@ -1,16 +1,10 @@
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from nics_drl_bridge.confidence import (
-    bound_rate,
-    estimate_mean,
-    estimate_rate,
-)
+from nics_drl_bridge.confidence import bound_rate, estimate_mean, estimate_rate
 
 
 @pytest.mark.parametrize(

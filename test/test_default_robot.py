@@ -1,7 +1,5 @@
 """One robot is the default of every command, env and node."""
 
-from __future__ import annotations
-
 import inspect
 
 from nics_drl_bridge.commands.cli import app

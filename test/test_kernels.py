@@ -1,7 +1,5 @@
 """Machine code is kept as long as nothing that it was compiled from changed, in every process."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Imports run one way, each library has one home, and importing the package costs nothing."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

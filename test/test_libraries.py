@@ -1,7 +1,5 @@
 """A library that is missing or too old, as a system's own packages may be, is one sentence."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

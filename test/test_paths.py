@@ -1,7 +1,5 @@
 """Whatever takes a place in the file system takes it as a Path and as plain text."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import direct_model

@@ -76,8 +76,8 @@ def open_bag(path: str | Path) -> "Iterator[BagFile]":
     is_ros_1 = path.suffix == ROS_1
     with ExitStack() as stack:
         with _refuse_damage(path, is_ros_1):
-            opened = _open_ros_1(path) if is_ros_1 else _open_ros_2(path)
-            bag = stack.enter_context(opened)
+            reader: Any = _open_ros_1(path) if is_ros_1 else _open_ros_2(path)
+            bag = BagFile(stack.enter_context(reader), str(path), is_ros_1)
         yield bag
 
 
@@ -99,18 +99,16 @@ def _refuse_damage(path: Path, is_ros_1: bool) -> Iterator[None]:
         ) from None
 
 
-@contextmanager
-def _open_ros_1(path: Path) -> "Iterator[BagFile]":
+def _open_ros_1(path: Path) -> "Ros1Reader":
     from rosbags.rosbag1 import Reader
 
     if not check_no_device(path).is_file():
         raise RecordingError(f"{path}: no such bag; check the path.")
-    with Reader(path) as reader:
-        yield BagFile(reader, str(path), is_ros_1=True)
+    return Reader(path)
 
 
 @contextmanager
-def _open_ros_2(path: Path) -> "Iterator[BagFile]":
+def _open_ros_2(path: Path) -> "Iterator[Reader]":
     from rosbags.rosbag2 import Reader
 
     place = _find_place(path)
@@ -127,15 +125,14 @@ def _open_ros_2(path: Path) -> "Iterator[BagFile]":
     for file in files:
         check_no_device(file)
     # Checked before rosbags reads it, because rosbags unpacks chunks of any size.
-    if place.is_dir():
-        with TemporaryDirectory() as room:
-            for file in _list_files(place, Path(room)):
-                _check_storage(file)
-    else:
-        _check_storage(place)
+    with TemporaryDirectory() as room:
+        if place.is_dir():
+            files = _list_files(place, Path(room))
+        for file in files:
+            _check_storage(file)
     with Reader(place) as reader:
         _check_summary(reader)
-        yield BagFile(reader, str(path))
+        yield reader
 
 
 def _find_place(path: Path) -> Path:

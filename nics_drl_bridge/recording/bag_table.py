@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import chain
 from typing import Any
@@ -33,7 +33,8 @@ SPANNED = 0.9  # fraction of a uniform distribution between the outer percentile
 LONGEST_ARRAY = 64  # elements of longer arrays are not listed
 # Message types that are not read as columns of numbers
 SCENES = re.compile(r"/(Compressed)?Image$|/PointCloud2?$|/LaserScan$")
-PART = re.compile(r"[^.\[\]]+")
+# a name, or what is between brackets, which end the path or precede a dot or another bracket
+STEPS = re.compile(r"([^.\[\]]+)|\[(.*?)\](?=[.\[]|$)")
 STAMPS: dict[str, roles.Stamps] = {
     "": "auto",
     mapped.HEADER: "header",
@@ -66,49 +67,28 @@ def list_fields(message: Any, path: str = "") -> Iterator[str]:
                 yield from list_fields(inner, where)
 
 
-def make_field_reader(path: str) -> Callable[[Any], Any]:
-    """Returns a function that reads a field of messages; NaN where a message lacks it.
+def read_field(message: Any, path: str) -> Any:
+    """Returns a field of a message; NaN where it lacks one.
 
-    Brackets at the end contain the name of an element if the message names them, even
-    if the name is a number or has dots.
+    Brackets contain the number of an element, or its name if the message names them, even if the
+    name is a number or has dots. Raises AttributeError for an unknown field.
     """
-    parts = PART.findall(path)
-    head, _, rest = path.partition("[")
-    *outer, last = PART.findall(head) or [""]
-    label = rest[:-1] if rest.endswith("]") else None
-
-    def read(message: Any) -> Any:
-        named = message
-        for part in outer:
-            named = getattr(named, part, None)
-        labels = getattr(named, NAMES, None)
-        if isinstance(labels, list) and label in labels and last != NAMES:
-            values = getattr(named, last)
+    owner = message
+    field = ""
+    for name, element in STEPS.findall(path):
+        label = name or element
+        if not isinstance(message, (list, tuple, np.ndarray)):
+            owner = message
+            field = label
+            message = getattr(message, label)
+            continue
+        labels = getattr(owner, NAMES, None)
+        k = int(label) if label.isdecimal() else -1
+        if isinstance(labels, list) and label in labels and field != NAMES:
             k = labels.index(label)
-            return values[k] if k < len(values) else np.nan
-        return _follow_path(message, parts)
-
-    return read
-
-
-def _follow_path(message: Any, parts: Sequence[str]) -> Any:
-    """Returns a part of a message by the names and numbers on the way to it; NaN if missing."""
-    within = message
-    for part in parts:
-        if isinstance(message, (list, tuple, np.ndarray)):
-            labels = getattr(within, NAMES, [])
-            if part.isdecimal():
-                k = int(part)
-            elif part in labels:
-                k = labels.index(part)
-            else:
-                k = -1
-            if not 0 <= k < len(message):
-                return np.nan
-            message = message[k]
-        else:
-            within = message
-            message = getattr(message, part)
+        if not 0 <= k < len(message):
+            return np.nan
+        message = message[k]
     if hasattr(message, "nanosec"):
         return message.sec + message.nanosec * S_PER_NS
     return message
@@ -117,20 +97,19 @@ def _follow_path(message: Any, parts: Sequence[str]) -> Any:
 def make_message_table(place: str, messages: Sequence[Message], **other: Any) -> Table:
     """Makes a table of the fields of messages; `other` fields of the table may be given."""
     # Messages about joints may each hold other ones.
-    kinds = {_list_sizes(message.content): message.content for message in messages}
+    kinds: dict[Any, Any] = {}
+    for message in messages:
+        content = message.content
+        labels = getattr(content, NAMES, None)
+        kind = None
+        if isinstance(labels, list):
+            arrays = (v for v in vars(content).values() if isinstance(v, np.ndarray))
+            kind = (*labels, *map(len, arrays))
+        kinds[kind] = content
     fields = chain.from_iterable(map(list_fields, kinds.values()))
     names = tuple(dict.fromkeys(fields))
     column = partial(read_column, place, names, messages)
     return Table(place, names, column, "message {}".format, **other)
-
-
-def _list_sizes(message: Any) -> Any:
-    """Returns the names in a message, with the lengths of its arrays; None without names."""
-    names = getattr(message, NAMES, None)
-    if not isinstance(names, list):
-        return None
-    sizes = [len(v) for v in vars(message).values() if isinstance(v, np.ndarray)]
-    return (*names, *sizes)
 
 
 def read_column(
@@ -147,9 +126,8 @@ def read_column(
     inner = next((name for name in names if name.startswith(path)), None)
     if inner is not None:
         hint = f"choose one, such as {inner!r}."
-    read = make_field_reader(path)
     try:
-        values = [read(message.content) for message in messages]
+        values = [read_field(message.content, path) for message in messages]
     except AttributeError:
         raise RecordingError(f"{place}: has no {path!r}; {hint}") from None
     if isinstance(values[0], str):
@@ -196,7 +174,13 @@ class Bag(Source):
             if types[topic] == roles.ODOMETRY
             and roles.guess_source_by_names((topic,), types[topic]) == "odometry"
         ]
-        return measure_latency(self.file, odometry[0] if len(odometry) == 1 else None)
+        odom = _find_topic(self.file, roles.ODOMETRY, "odom")
+        if len(odometry) == 1:
+            odom = odometry[0]
+        scan = _find_topic(self.file, SCAN, "scan")
+        return Latency(
+            scan=_measure_delay(self.file, scan), odom=_measure_delay(self.file, odom)
+        )
 
     def read(self, name: str) -> Table:
         """Reads a topic."""
@@ -275,10 +259,7 @@ def list_topics_used(
 
 
 def select_transforms(
-    place: str,
-    messages: Sequence[Message],
-    frame: str | None,
-    child: str | None,
+    place: str, messages: Sequence[Message], frame: str | None, child: str | None
 ) -> list[Message]:
     """Returns the transforms between two frames, by default between the only two.
 
@@ -290,11 +271,11 @@ def select_transforms(
             pair = get_frames(transform)
             part = Message(message.receive_ns, transform)
             transforms.setdefault(pair, []).append(part)
+    wanted = [name and name.strip("/") for name in (frame, child)]
     pairs = [
-        (parent, child_frame)
-        for parent, child_frame in transforms
-        if frame is None or frame.strip("/") == parent
-        if child is None or child.strip("/") == child_frame
+        pair
+        for pair in transforms
+        if all(name in (None, own) for name, own in zip(wanted, pair, strict=True))
     ]
     if len(pairs) == 1:
         return transforms[pairs[0]]
@@ -311,27 +292,12 @@ def select_transforms(
     )
 
 
-def measure_latency(bag: BagFile, odom: str | None = None) -> Latency:
-    """Measures the delays of scan and odometry on the recorder's own clock, if a bag shows them."""
-    odom = odom or _find_topic(bag, roles.ODOMETRY, "odom")
-    return Latency(
-        scan=_measure_delay(bag, _find_topic(bag, SCAN, "scan")),
-        odom=_measure_delay(bag, odom),
-    )
-
-
 def _find_topic(bag: BagFile, kind: str, name: str) -> str | None:
     """Returns the only topic of a type, or the only one of several with the usual name."""
-    topics = [
-        topic
-        for topic, topic_kind in bag.types.items()
-        if topic_kind == kind and topic not in bag.empty
-    ]
+    topics = [t for t, its in bag.types.items() if its == kind and t not in bag.empty]
     if len(topics) > 1:
         topics = [topic for topic in topics if re.search(rf"(^|/){name}$", topic)]
-    if len(topics) != 1:
-        return None
-    return topics[0]
+    return topics[0] if len(topics) == 1 else None
 
 
 def _measure_delay(bag: BagFile, topic: str | None) -> Delay | None:

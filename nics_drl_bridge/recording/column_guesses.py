@@ -8,20 +8,19 @@ The guesses serve only the draft of a mapping: opening a recording never guesses
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, find_table_axis
-from nics_drl_bridge.recording.mapping import NO_COMMANDS, UNITS
-from nics_drl_bridge.recording.names import split_words, word_set
+from nics_drl_bridge.recording.mapping import NO_COMMANDS, UNITS, word_set
 from nics_drl_bridge.recording.survey import TICKS, Field, TableSurvey, split_unit
 from nics_drl_bridge.recording.table import Column, is_text
 from nics_drl_bridge.recording.values import match_values
 from nics_drl_bridge.robot.spec import find_kind, list_kinds
-from nics_drl_bridge.robot.template import list_names
+from nics_drl_bridge.robot.template import Template, list_names
 
 # Words of the first coordinate, with the matching word of the second
 COORDINATES = {
@@ -34,7 +33,7 @@ COORDINATES = {
 }
 GLOBE = {"longitude": "latitude", "lon": "lat", "lng": "lat", "long": "lat"}
 ALL_COORDINATES = COORDINATES | GLOBE
-HEADINGS = (
+HEADINGS = [
     "yaw",
     "heading",
     "theta",
@@ -44,7 +43,7 @@ HEADINGS = (
     "orientation",
     "angle",
     "phi",
-)
+]
 # Words of columns with positions of something else, motions, sensor data or deviations
 OTHERS = word_set("""
     goal target waypoint waypoints ref reference setpoint desired initialpose
@@ -84,15 +83,20 @@ MODES = ENABLING | word_set("mode state status safety switch")
 EPISODES = word_set("episode ep trial traj trajectory rollout run")
 MIN_MEAN_EPISODE_ROWS = 20  # minimum number of rows of an episode, on average
 OF_MESSAGE = "angular_velocity.z"  # a field of sensor_msgs/Imu
-TURNING = (
-    {"gyro", "z"},
-    {"gz"},
-    {"gyroz"},
-    {"gyro", "yaw"},
-    {"yaw", "rate"},
-    {"yawrate"},
-)
-TURNING_OF_IMU = (*TURNING, {"w"}, {"wz"}, {"omega"}, {"angular", "z"}, {"z", "rate"})
+NAMES_OF_YAW_RATE = """
+    gyro z
+    gz
+    gyroz
+    gyro yaw
+    yaw rate
+    yawrate
+    w
+    wz
+    omega
+    angular z
+    z rate
+"""
+TURNING_OF_IMU = [word_set(line) for line in NAMES_OF_YAW_RATE.strip().splitlines()]
 NOT_OF_GYRO = word_set("""
     cmd command commanded ref setpoint target desired covariance
     odom odometry vicon mocap gt truth
@@ -146,6 +150,7 @@ CORNERS = (
     ("rear_left", word_set("rl bl lr"), REAR, LEFT),
     ("rear_right", word_set("rr br"), REAR, RIGHT),
 )
+WHEELS = tuple(corner for corner, *_ in CORNERS)
 NO_VEHICLE = word_set("motor arm gripper pan tilt head fan")
 STEERING = word_set("steering steer delta servo")
 PULSES = word_set("pwm duty")  # what a motor driver is sent
@@ -156,9 +161,32 @@ SPEED = word_set("speed velocity vel v vx linear lin forward trans cmdvel")
 ORIENTATIONS = word_set("yaw heading rotation")
 RATES = word_set("rate speed velocity vel")
 POSITIONS = word_set("position pos")
+FORMS_OF_TURN = (
+    (TURNS_OF_BODY,),
+    (word_set("yaw"), word_set("rate")),
+    (word_set("theta th"), RATES),
+)
+# A command's meaning by its name, with a word from each of these sets; the first row counts
+MEANINGS: tuple[tuple[str | None, tuple[frozenset[str], ...]], ...] = (
+    *((corner, (short,)) for corner, short, _, _ in CORNERS),
+    *((corner, (along, across)) for corner, _, along, across in CORNERS),
+    (None, (LEFT, RIGHT)),
+    ("left", (LEFT,)),
+    ("right", (RIGHT,)),
+    (None, (STEERING, RATES)),
+    ("steering", (STEERING,)),
+    (None, (NO_VEHICLE,)),
+    ("throttle", (THROTTLE,)),
+    ("traction", (word_set("traction"),)),
+    *((None, (*form, word_set("x y linear"))) for form in FORMS_OF_TURN),
+    *(("turn", form) for form in FORMS_OF_TURN),
+    ("side", (word_set("vy"),)),
+    ("side", (SPEED, word_set("y"))),
+    (None, (SPEED, word_set("z vz"))),
+    ("speed", (SPEED,)),
+)
 # Kinds of robots, with the names of their commands by meaning; the `words` of a template name those
 # of other kinds.
-WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 KINDS: tuple[tuple[str, dict[str, str]], ...] = (
     ("mecanum", {wheel: f"{wheel}_wheel" for wheel in WHEELS}),
     ("omnidirectional", {"speed": "vx", "side": "vy", "turn": "wz"}),
@@ -185,12 +213,11 @@ MOST_CANDIDATES = 8
 
 
 class PoseGuess(NamedTuple):
-    """Columns of a pose; either a heading or a quaternion."""
+    """Columns of a pose."""
 
     x: Field
     y: Field
-    heading: Field | None = None
-    quaternion: tuple[Field, ...] = ()  # x, y, z, w
+    orientation: tuple[Field, ...]  # a heading, or x, y, z, w of a quaternion
 
     @property
     def table(self) -> TableSurvey:
@@ -200,8 +227,7 @@ class PoseGuess(NamedTuple):
     @property
     def columns(self) -> tuple[Field, ...]:
         """All columns that it uses."""
-        heading = () if self.heading is None else (self.heading,)
-        return (self.x, self.y, *heading, *self.quaternion)
+        return (self.x, self.y, *self.orientation)
 
 
 def is_used(column: Field, pose: PoseGuess | None) -> bool:
@@ -215,27 +241,25 @@ def guess_pose(tables: Sequence[TableSurvey]) -> PoseGuess | None:
     poses: list[PoseGuess] = []
     for table in tables:
         # With several tables, their names show their content.
-        if len(tables) == 1 or OTHERS.isdisjoint(split_words(table.name)):
-            poses.extend(_find_named_poses(table))
+        if table.is_single or not table.words & OTHERS:
+            poses += _find_named_poses(table)
     return max(poses, key=_rank_pose, default=None)
 
 
 def _rank_pose(pose: PoseGuess) -> float:
     """Ranks a pose by what its names say about its source."""
-    words = {*split_words(pose.x.name)}
+    words = pose.x.name_words
     # A column's name that states its source outweighs the file's name.
     if pose.table.kind or not words & SOURCES:
-        words |= {*split_words(pose.table.name)}
-    rank = 0.0
+        words |= pose.table.words
+    rank = 0.5 * len(pose.orientation[1:])
     if words & TRACKERS or {"ground", "truth"} <= words:
-        rank += 3.0
+        rank += 9.0
     elif words & LOCALISERS:
-        rank += 2.0
+        rank += 6.0
     if words & SENSORS:
-        rank -= 2.0
-    if pose.table.kind.endswith("/TFMessage"):
-        rank -= 1.0
-    return rank + 0.5 * bool(pose.quaternion)
+        rank -= 6.0
+    return rank - 3.0 * pose.table.kind.endswith("/TFMessage")
 
 
 def _find_named_poses(table: TableSurvey) -> Iterator[PoseGuess]:
@@ -250,16 +274,13 @@ def _find_named_poses(table: TableSurvey) -> Iterator[PoseGuess]:
         if {*words} & (NOT_PLACES | TURNS):
             continue
         for first, second in ALL_COORDINATES.items():
-            if first not in words:
-                continue
-            words_of_y = [second if word == first else word for word in words]
-            y = columns.get(tuple(words_of_y))
+            y = columns.get(tuple(second if w == first else w for w in words))
             kinds = ["m"] + ["rad"] * (first in GLOBE)
-            if y is None or not (x.moves or y.moves) or not _is_in(x, kinds):
+            if first not in words or y is None or not _is_in(x, kinds):
                 continue
             orientation = _find_orientation(words, columns)
-            if orientation:
-                yield PoseGuess(x, y, **orientation)
+            if orientation and (x.moves or y.moves):
+                yield PoseGuess(x, y, orientation)
 
 
 def _is_in(column: Field, kinds: Sequence[str]) -> bool:
@@ -269,30 +290,24 @@ def _is_in(column: Field, kinds: Sequence[str]) -> bool:
 
 def _find_orientation(
     place: tuple[str, ...], columns: Mapping[tuple[str, ...], Field]
-) -> dict[str, Any]:
+) -> tuple[Field, ...]:
     """Returns the quaternion, else the heading, that shares the most words with a place."""
-    quaternions: list[tuple[int, tuple[Field, ...]]] = []
-    headings: list[tuple[float, Field]] = []
+    found: list[tuple[bool, float, tuple[Field, ...]]] = []
     for words, column in columns.items():
-        if not words or {*words} & SENSORS - {*place}:
+        if not words or {*words} & (SENSORS - {*place}):
             continue  # from another source than the place
         *first, last = words
         shared = len({*words} & {*place})
         if last in ("w", "qw"):
             axes = [(*first, last[:-1] + axis) for axis in "xyzw"]
             if all(axis in columns for axis in axes) and axes[0] != place:
-                quaternions.append((shared, tuple(columns[axis] for axis in axes)))
+                found.append((True, shared, tuple(columns[axis] for axis in axes)))
         elif last in HEADINGS and not {*words} & NOT_PLACES and _is_in(column, ["rad"]):
-            headings.append((shared - 0.1 * HEADINGS.index(last), column))
-    if quaternions:
-        return {"quaternion": max(quaternions, key=itemgetter(0))[1]}
-    if headings:
-        return {"heading": max(headings, key=itemgetter(0))[1]}
+            found.append((False, shared - 0.1 * HEADINGS.index(last), (column,)))
     z = columns.get((*place[:-1], "z"))
-    has_angle = place[-1] == "x" and "position" not in place
-    if has_angle and z is not None and _is_in(z, ["rad"]) and _wraps(z.numbers):
-        return {"heading": z}
-    return {}
+    if found or z is None or place[-1] != "x" or "position" in place:
+        return max(found, key=itemgetter(0, 1), default=(False, 0.0, ()))[2]
+    return (z,) if _is_in(z, ["rad"]) and _wraps(z.numbers) else ()
 
 
 def _wraps(values: Array) -> bool:
@@ -328,11 +343,10 @@ def guess_switches(tables: Sequence[TableSurvey]) -> tuple[Switch, ...]:
         for column in table.columns:
             values = column.values
             on = _find_on_value({*column.words}, values)
-            if on is None:
-                continue
-            switches.append(Switch(column, on))
-            if len(values) == table.rows:
-                is_on &= match_values(values, on)
+            if on is not None:
+                switches.append(Switch(column, on))
+                if len(values) == table.rows:
+                    is_on &= match_values(values, on)
         if table.rows and not is_on.any():
             return ()
     return tuple(switches)
@@ -363,9 +377,7 @@ def _find_on_value(words: set[str], values: Column) -> float | str | None:
 def guess_episode(tables: Sequence[TableSurvey]) -> Field | None:
     """Finds the only column that numbers episodes; None if there is none, or several."""
     columns = [c for table in tables for c in table.columns if _numbers_episodes(c)]
-    if len(columns) != 1:
-        return None
-    return columns[0]
+    return columns[0] if len(columns) == 1 else None
 
 
 def _numbers_episodes(column: Field) -> bool:
@@ -391,8 +403,8 @@ def guess_yaw_rate(tables: Sequence[TableSurvey]) -> Field | None:
     columns = [column for table in tables for column in table.numbers if column.moves]
     rates = [c for c in columns if _is_rate_of_message(c)]
     rates = rates or [c for c in columns if _is_named_like_yaw_rate(c)]
-    usual = [rate for rate in rates if rate.table.name in USUAL_NAMES]
-    return next(iter(usual or rates), None)
+    rates.sort(key=lambda rate: rate.table.name not in USUAL_NAMES)
+    return next(iter(rates), None)
 
 
 def write_imu_line(rate: Field, common_time: str | None) -> str:
@@ -419,7 +431,7 @@ def write_value(column: Field, keys: Sequence[str], common_time: str | None) -> 
 def _is_rate_of_message(column: Field) -> bool:
     """True for the yaw rate in messages of an IMU, by the axis that points up."""
     table = column.table
-    if not {OF_MESSAGE, "linear_acceleration.x"} <= table.data.keys():
+    if not {OF_MESSAGE, "linear_acceleration.x"} <= table.by_name.keys():
         return False
     axis = AXES[_find_message_axis(table).place]
     return column.name == f"angular_velocity.{axis}"
@@ -427,17 +439,17 @@ def _is_rate_of_message(column: Field) -> bool:
 
 def _find_message_axis(table: TableSurvey) -> UpAxis:
     """Returns the axis of an IMU's messages that points up; z without accelerations."""
-    names = [f"linear_acceleration.{axis}" for axis in AXES]
-    if not all(name in table.data for name in names):
-        return UpAxis()
-    return find_table_axis(lambda name: np.asarray(table.data[name], np.float64))
+    columns = table.by_name
+    if all(f"linear_acceleration.{axis}" in columns for axis in AXES):
+        return find_table_axis(lambda name: columns[name].numbers)
+    return UpAxis()
 
 
 def _is_named_like_yaw_rate(column: Field) -> bool:
-    words = {*split_words(column.name)}
-    around = words | {*split_words(column.table.name)}
-    wanted = TURNING_OF_IMU if around & {"imu", "gyro"} else ()
-    return any(names <= words for names in wanted) and not around & NOT_OF_GYRO
+    words = column.name_words
+    around = words | column.table.words
+    is_of_gyro = around & {"imu", "gyro"} and not around & NOT_OF_GYRO
+    return bool(is_of_gyro) and any(names <= words for names in TURNING_OF_IMU)
 
 
 class Candidate(NamedTuple):
@@ -481,47 +493,50 @@ def guess_command(
     """Finds the columns that drive a robot of a known kind, or candidates for its commands."""
     candidates: list[Candidate] = []
     for table in tables:
-        candidates += _find_candidates(table, len(tables) > 1, pose)
+        candidates += _find_candidates(table, pose)
     candidates = _accept_steering(candidates)
-    certain = [column for column in candidates if column.strength >= LIKELY]
+    certain = [each for each in candidates if each.strength >= LIKELY]
     kind, commands = _choose_kind(certain)
     if kind is not None:
         return CommandGuess(kind, commands, {})
     if not certain:
         kind, commands = _choose_kind(list(_find_wheels(tables)))
         if kind is not None:
-            wheels = [wheel.column for wheel in commands.values()]
+            wheels = [each.column for each in commands.values()]
             others = [each for each in candidates if each.column not in wheels]
             named = _choose_kind(others)[1]
             return CommandGuess(kind, commands, named, of_wheels=True)
     if not candidates:
         for table in tables:
-            candidates += _find_unexplained(table, len(tables) > 1, pose)
+            candidates += _find_unexplained(table, pose)
     kind, named = _choose_kind(candidates)
     if kind is None:
         candidates.sort(key=lambda column: -column.strength)
-        for candidate in candidates[:MOST_CANDIDATES]:
-            named[f"command_{len(named)}"] = candidate
+        for k, each in enumerate(candidates[:MOST_CANDIDATES]):
+            named[f"command_{k}"] = each
     return CommandGuess(kind, {}, named)
 
 
-def _find_candidates(
-    table: TableSurvey, has_others: bool, pose: PoseGuess | None
-) -> Iterator[Candidate]:
+def _find_candidates(table: TableSurvey, pose: PoseGuess | None) -> Iterator[Candidate]:
     """Yields the columns of a table that were or may have been sent to the robot."""
-    if STANDARD_PACKAGES.match(table.kind) and table.kind not in TWIST_KINDS:
+    is_twist = table.kind in TWIST_KINDS
+    if STANDARD_PACKAGES.match(table.kind) and not is_twist:
         return
-    has_pose = pose is not None and pose.table is table
     # A file's name shows its content only if there are other files and one contains the
     # pose.
+    has_pose = pose is not None and pose.table is table
     context: set[str] = set()
-    if table.kind or (has_others and not has_pose):
-        context = {*split_words(table.name)}
+    if table.kind or not (table.is_single or has_pose):
+        context = table.words
     if context & NOT_COMMANDED and not context & COMMANDING:
         return
     context_of_topic: set[str] = set()
+    rank = 0
     if table.kind:
         context_of_topic = context & BARE_TWIST
+        # by its distance to the robot: `cmd_vel` itself before the inputs of a mux
+        is_input = context & ROUNDABOUT and "output" not in context
+        rank = -1 if is_input else int(context <= BARE_TWIST)
     for column in table.numbers:
         words = {*column.words}
         if (words | context) & (COMMANDING | WISHING):
@@ -529,10 +544,9 @@ def _find_candidates(
         if words & NOT_COMMANDED or column.is_place_on_earth or is_used(column, pose):
             continue
         meaning = guess_meaning(words | context_of_topic)
-        strength = _estimate_strength(table, words, context, meaning)
-        if meaning is None and (strength < LIKELY or table.kind in TWIST_KINDS):
-            continue
-        yield Candidate(column, meaning, strength, _rank_topic(table, context))
+        strength = _estimate_strength(table.kind, words, context, meaning)
+        if meaning is not None or (strength >= LIKELY and not is_twist):
+            yield Candidate(column, meaning, strength, rank)
 
 
 def _name_commanded(words: set[str]) -> set[str]:
@@ -545,125 +559,79 @@ def _name_commanded(words: set[str]) -> set[str]:
 
 
 def _find_unexplained(
-    table: TableSurvey, has_others: bool, pose: PoseGuess | None
+    table: TableSurvey, pose: PoseGuess | None
 ) -> Iterator[Candidate]:
     """Yields the columns without a name, or with an unknown one, as in other languages.
 
     Each may have been sent to the robot, or measured.
     """
-    if STANDARD_PACKAGES.match(table.kind):
-        return
     pose_is_elsewhere = pose is not None and pose.table is not table
-    has_place = bool(table.kind) or pose_is_elsewhere
-    if has_place and has_others and NOT_COMMANDED.intersection(split_words(table.name)):
+    shows_content = not table.is_single and (table.kind or pose_is_elsewhere)
+    if STANDARD_PACKAGES.match(table.kind) or (
+        shows_content and table.words & NOT_COMMANDED
+    ):
         return
     for column in table.numbers:
-        says_something = not EXPLAINED.isdisjoint(split_words(column.name))
-        if says_something or is_used(column, pose) or _counts_rows(column):
+        if column.name_words & EXPLAINED or is_used(column, pose):
             continue
-        if column.moves and not column.is_place_on_earth:
+        counts_rows = column.name.isdecimal() and (np.diff(column.numbers) == 1).all()
+        if column.moves and not column.is_place_on_earth and not counts_rows:
             yield Candidate(column, None, POSSIBLE)
 
 
-def _counts_rows(column: Field) -> bool:
-    """True for a column without a name that numbers the rows."""
-    return column.name.isdecimal() and bool((np.diff(column.numbers) == 1.0).all())
-
-
 def _estimate_strength(
-    table: TableSurvey, words: set[str], context: set[str], meaning: str | None
+    kind: str, words: set[str], context: set[str], meaning: str | None
 ) -> int:
-    if table.kind in ACKERMANN_KINDS and meaning is None:
+    is_command = kind in ACKERMANN_KINDS
+    if is_command and meaning is None:
         return POSSIBLE
-    if table.kind in ACKERMANN_KINDS or (words | context) & COMMANDING:
+    if is_command or (words | context) & COMMANDING:
         return CERTAIN
-    if meaning == "throttle" or (words & (WISHING | PULSES) and meaning is not None):
-        return LIKELY
-    return POSSIBLE
-
-
-def _rank_topic(table: TableSurvey, context: set[str]) -> int:
-    """Ranks a topic by its distance to the robot: `cmd_vel` itself before the inputs of a mux."""
-    if not table.kind:
-        return 0
-    if context & ROUNDABOUT and "output" not in context:
-        return -1
-    return int(context <= BARE_TWIST)
+    is_goal = words & (WISHING | PULSES) and meaning is not None
+    return LIKELY if is_goal or meaning == "throttle" else POSSIBLE
 
 
 def guess_meaning(words: set[str]) -> str | None:
     """Returns the meaning of a command with these words in its name; None if it is unclear."""
-    is_speed = bool(words & {"velocity", "vel", "rate", "speed"})
-    is_left = bool(words & LEFT)
-    is_right = bool(words & RIGHT)
-    for corner, short, lengthwise, sideways in CORNERS:
-        if words & short or (words & lengthwise and words & sideways):
-            return corner
-    if words & STEERING and not (is_left or is_right):
-        if is_speed:
-            return None
-        return "steering"
-    if is_left and is_right:
-        return None
-    if is_left:
-        return "left"
-    if is_right:
-        return "right"
-    if words & NO_VEHICLE:
-        return None
-    if words & THROTTLE:
-        return "throttle"
-    if "traction" in words:
-        return "traction"
-    is_angle = bool(words & {"theta", "th"})
-    if words & TURNS_OF_BODY or {"yaw", "rate"} <= words or (is_angle and is_speed):
-        if words & {"x", "y", "linear"}:
-            return None
-        return "turn"
-    if "vy" in words or (words & SPEED and "y" in words):
-        return "side"
-    if words & SPEED and not words & {"z", "vz"}:
-        return "speed"
+    for meaning, groups in MEANINGS:
+        if all(words & group for group in groups):
+            return meaning
     return None
 
 
 def _accept_steering(candidates: Sequence[Candidate]) -> list[Candidate]:
     """Counts a plain `steering` as a command if a throttle was also recorded."""
-    has_throttle = any(
-        candidate.meaning == "throttle" and candidate.strength >= LIKELY
+    if not any(c.meaning == "throttle" and c.strength >= LIKELY for c in candidates):
+        return list(candidates)
+    return [
+        candidate._replace(strength=max(candidate.strength, LIKELY))
+        if candidate.column.words in (["steering"], ["steer"])
+        else candidate
         for candidate in candidates
-    )
-    accepted = []
-    for candidate in candidates:
-        words = candidate.column.words
-        if has_throttle and words in (["steering"], ["steer"]):
-            strength = max(candidate.strength, LIKELY)
-            candidate = candidate._replace(strength=strength)
-        accepted.append(candidate)
-    return accepted
+    ]
 
 
 def _choose_kind(
     candidates: Sequence[Candidate],
 ) -> tuple[str | None, dict[str, Candidate]]:
     """Returns the kind of robot that these columns drive best, and its commands by name."""
-    kinds: list[tuple[str, Mapping[str, str]]] = []
-    for name in list_kinds():
-        kind = find_kind(name)
-        if kind is not None:
-            kinds.append((name, kind.template.words))
     best: tuple[str | None, dict[str, Candidate]] = (None, {})
-    best_merit: tuple[int, int] | None = None
+    best_merit = (0, 0)
+    kinds = ((name, template.words) for name, template in _list_templates().items())
     for name, words in (*kinds, *KINDS):
         commands = _match_commands(words, candidates)
         still = sum(command.is_still for command in commands.values())
-        if still == len(commands):
-            continue
-        strength = min(command.strength for command in commands.values())
-        if best_merit is None or (strength, -still) > best_merit:
-            best_merit = strength, -still
-            best = name, commands
+        if still < len(commands):
+            strength = min(command.strength for command in commands.values())
+            if (strength, -still) > best_merit:
+                best_merit = strength, -still
+                best = name, commands
     return best
+
+
+def _list_templates() -> dict[str, Template]:
+    kinds = {name: find_kind(name) for name in list_kinds()}
+    return {name: kind.template for name, kind in kinds.items() if kind is not None}
 
 
 def _match_commands(
@@ -676,10 +644,9 @@ def _match_commands(
         if not fitting:
             return {}
         best = max(fitting, key=lambda column: column.merit)
-        for rival in fitting:
-            is_equal = np.array_equal(best.column.values, rival.column.values)
-            if rival.merit == best.merit and not is_equal:
-                return {}
+        values = [c.column.values for c in fitting if c.merit == best.merit]
+        if not all(np.array_equal(best.column.values, others) for others in values):
+            return {}
         commands[name] = best
     return commands
 
@@ -687,31 +654,22 @@ def _match_commands(
 def _find_wheels(tables: Sequence[TableSurvey]) -> Iterator[Candidate]:
     """Yields the measured ticks or speeds of wheels, which replace missing commands."""
     for table in tables:
-        if STANDARD_PACKAGES.match(table.kind):
-            continue
         for column in table.numbers:
-            words = {*split_words(column.name)}
+            words = column.name_words
             is_wheel = words & WHEEL_WORDS and not words & NO_SPEED
-            if not is_wheel or not column.moves:
+            if STANDARD_PACKAGES.match(table.kind) or not (is_wheel and column.moves):
                 continue
             words_of_side = {*split_unit(column.name)[0]} - TICKS
             meaning = guess_meaning(words_of_side - {"speed", "velocity", "vel"})
             if meaning in ("left", "right", *WHEELS):
-                rank = int(bool(words & TICKS))
-                yield Candidate(column, meaning, LIKELY, rank)
+                yield Candidate(column, meaning, LIKELY, int(bool(words & TICKS)))
 
 
 def find_look_alikes(name: str) -> list[str]:
     """Returns the other kinds of robots that have the same commands."""
-    kind = find_kind(name)
-    if kind is None:
-        return []
-    commands = [{*list_names(names)} for names in kind.template.commands]
-    look_alikes = []
-    for other_name in list_kinds():
-        other = find_kind(other_name)
-        if other_name == name or other is None:
-            continue
-        if any({*list_names(names)} in commands for names in other.template.commands):
-            look_alikes.append(other_name)
-    return look_alikes
+    sets = {
+        kind: [{*list_names(commands)} for commands in template.commands]
+        for kind, template in _list_templates().items()
+    }
+    names = sets.pop(name, [])
+    return [kind for kind, others in sets.items() if any(o in names for o in others)]

@@ -3,7 +3,6 @@
 # Identification, ch. 21). A segment is accepted if it stays in the circle and the robot can turn
 # back from its end.
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -15,7 +14,13 @@ from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.messages import POSITION_UNITS
-from nics_drl_bridge.robot.kinds import has_textbook, reach, textbook
+from nics_drl_bridge.robot.kinds import (
+    NO_LAG_S,
+    Textbook,
+    has_textbook,
+    reach,
+    textbook,
+)
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.seeds import check_seeds
 
@@ -59,7 +64,7 @@ class Exploration:
     def __init__(self, plan: "DrivePlan", rng: np.random.Generator) -> None:
         spec = plan.robot
         self._plan = plan
-        self._motion = predict_motion(spec)
+        self._motion = find_motion(spec)
         self._rng = rng
         fraction = np.array(
             [1.0 if c.unit in POSITION_UNITS else plan.speed for c in spec.command]
@@ -76,7 +81,7 @@ class Exploration:
         self._varied = 0
         self._queue = np.zeros((0, len(spec.command)))
         self._command = self.rest
-        self._state = np.zeros(self._motion.size)
+        self._state = np.zeros(len(self._motion.lag))
         self.pose: Array = np.zeros(3)
         self._before = self.pose
         self._has_observed = False
@@ -158,7 +163,7 @@ class Exploration:
         count = len(commands)
         pose = np.repeat(self.pose[None], count, 0)
         state = np.repeat(self._state[None], count, 0)
-        return self._motion.predict(pose, state, commands, period)
+        return predict(self._motion, pose, state, commands, period)
 
     def _find_cells(self, command: Array) -> tuple[NDArray[np.intp], ...]:
         fraction = (command - self.low) / (self.high - self.low)
@@ -236,9 +241,8 @@ class Exploration:
         """Returns how close to the centre return paths lead, over the radius; inf if none."""
         count = len(self._returns)
         start = np.repeat(pose, count, 0), np.repeat(state, count, 0)
-        poses, _ = self._motion.predict(
-            *start, np.tile(self._returns, (len(pose), 1, 1)), RETURN_STEP_S
-        )
+        returns = np.tile(self._returns, (len(pose), 1, 1))
+        poses, _ = predict(self._motion, *start, returns, RETURN_STEP_S)
         away = _compute_distance(poses)
         is_inside = away.max(axis=1) <= limit
         turned = (
@@ -248,12 +252,9 @@ class Exploration:
         back = (away.min(axis=1) < NEARER * away[:, 0]) | (
             away[:, 0] < NEAR * self._outermost
         )
-        useful = (is_inside & (turned | back)).reshape(len(pose), count).any(axis=1)
-        reached = (
-            np.where(is_inside, away.min(axis=1), np.inf)
-            .reshape(len(pose), count)
-            .min(axis=1)
-        )
+        useful = (is_inside & (turned | back)).reshape(-1, count).any(axis=1)
+        nearest = np.where(is_inside, away.min(axis=1), np.inf)
+        reached = nearest.reshape(-1, count).min(axis=1)
         return np.where(useful, reached / self._outermost, np.inf)
 
     def _return_to_circle(self, length: int) -> Array:
@@ -324,42 +325,25 @@ class Pattern:
         )
 
 
-@dataclass(frozen=True)
-class ExpectedMotion:
-    """Expected motion of a robot."""
-
-    size: int  # size of the state, S
-    # state, command, time held [s] -> state
-    respond: Callable[[Array, Array, float], Array]
-    twist: Callable[[Array, Array], Array]  # state, command -> body twist
-
-    def predict(
-        self, pose: Array, state: Array, command: Array, period: float
-    ) -> tuple[Array, Array]:
-        """Predicts poses (K, T + 1, 3) and states from commands (K, T, C), one arc a period [s]."""
-        poses = [pose]
-        states = [state]
-        for n in range(command.shape[1]):
-            now = command[:, n]
-            middle = self.respond(state, now, period / 2.0)
-            pose = geometry.compose(
-                pose, geometry.exp(self.twist(middle, now) * period)
-            )
-            state = self.respond(state, now, period)
-            poses.append(pose)
-            states.append(state)
-        return np.stack(poses, axis=1), np.stack(states, axis=1)
+def predict(
+    motion: Textbook, pose: Array, state: Array, command: Array, period: float
+) -> tuple[Array, Array]:
+    """Predicts poses (K, T + 1, 3) and states from commands (K, T, C), one arc a period [s]."""
+    poses = [pose]
+    states = [state]
+    for goal in np.moveaxis(motion.target(command), 1, 0):
+        middle = motion.respond(state, goal, period / 2.0)
+        pose = geometry.compose(pose, geometry.exp(motion.twist(middle) * period))
+        state = motion.respond(state, goal, period)
+        poses.append(pose)
+        states.append(state)
+    return np.stack(poses, axis=1), np.stack(states, axis=1)
 
 
-def predict_motion(spec: RobotSpec) -> ExpectedMotion:
+def find_motion(spec: RobotSpec) -> Textbook:
     """Returns the motion by textbook, else by `cmd_vel`. Raises ConfigError if there is neither."""
     if has_textbook(spec):
-        book = textbook(spec)
-        return ExpectedMotion(
-            len(book.lag),
-            lambda state, command, t: book.respond(state, book.target(command), t),
-            lambda state, _: book.twist(state),
-        )
+        return textbook(spec)
     for command in spec.command:
         if not command.is_twist:
             raise ConfigError(
@@ -367,10 +351,12 @@ def predict_motion(spec: RobotSpec) -> ExpectedMotion:
                 f"{command.unit} can't be predicted; add `textbook:` and its "
                 "`parameters:` to the robot's YAML file."
             )
-    return ExpectedMotion(
-        len(spec.state),
-        lambda state, *_: state,
-        lambda _, command: spec.to_cmd_vel(command),
+    return Textbook(
+        twist=lambda state: state,
+        target=spec.to_cmd_vel,
+        lag=np.full(3, NO_LAG_S),
+        rate=np.full(3, np.inf),
+        structure={},
     )
 
 

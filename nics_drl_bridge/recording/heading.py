@@ -4,7 +4,7 @@ Wheels slip when a robot turns, so odometry may report too much or too little tu
 not slip, but has a bias, which shows while the wheels stand still.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,21 +81,17 @@ class Turning(GyroBias):
     def in_degrees(self) -> bool:
         """True if the gyro seems to measure in degrees per second."""
         low, high = IN_DEGREES
-        return (
-            self.compared
-            and self.alike > MIN_SAME_MOTION_CORRELATION
-            and low < 1.0 / max(self.scale, 1e-9) < high
-        )
+        return self._is_same_motion and low < 1.0 / self.scale < high
 
     @property
     def plausible(self) -> bool:
         """True if both measure the same motion, in the same unit and direction."""
         low, high = PLAUSIBLE_SCALES
-        return (
-            self.compared
-            and self.alike > MIN_SAME_MOTION_CORRELATION
-            and low < self.scale < high
-        )
+        return self._is_same_motion and low < self.scale < high
+
+    @property
+    def _is_same_motion(self) -> bool:
+        return self.compared and self.alike > MIN_SAME_MOTION_CORRELATION
 
     @property
     def contradicts(self) -> bool:
@@ -112,7 +108,7 @@ def compare_turning(
 
     Returns None if they overlap for too short a time.
     """
-    if len(t) < FEWEST_BLOCKS or len(gyro_t) < FEWEST_BLOCKS:
+    if min(len(t), len(gyro_t)) < FEWEST_BLOCKS:
         return None
     blocks = _split_blocks(t, pose, gyro_t, yaw_rate)
     if len(blocks.span) < FEWEST_BLOCKS:
@@ -123,7 +119,7 @@ def compare_turning(
     apart = _compute_rms(blocks, blocks.odom_rate - unbiased, window_s)
     turned = _compute_rms(blocks, unbiased, window_s)
     return Turning(
-        **asdict(bias),
+        **vars(bias),
         scale=scale,
         scale_std=scale_std,
         alike=alike,
@@ -148,17 +144,19 @@ def turn_by_gyro(
     standing = (step == 0.0).all(axis=1)
     step[covered, 2] = gyro_turn[covered]
     step[standing, 2] = 0.0
-    moved = geometry.exp(step)
-    heading = pose[0, 2] + np.concatenate([[0.0], np.cumsum(moved[:, 2])])
-    shift = geometry.rotate(moved[:, :2], heading[:-1])
-    position = pose[0, :2] + np.concatenate(
-        [np.zeros((1, 2)), np.cumsum(shift, axis=0)]
-    )
-    turned = np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
+    turned = chain_poses(pose[0], geometry.exp(step))
     span = np.diff(t)
     driven = span < MAX_POSE_PAUSE_S  # a longer span separates two recordings
     driven_s = max(float(span[driven].sum()), 1e-9)
     return turned, float(span[covered & driven].sum()) / driven_s
+
+
+def chain_poses(pose: Array, relative: Array) -> Array:
+    """Returns poses (T + 1, 3) from `pose` (3,) on, each `relative` (T, 3) to the one before."""
+    heading = pose[2] + np.append(0.0, np.cumsum(relative[:, 2]))
+    shift = geometry.rotate(relative[:, :2], heading[:-1])
+    position = pose[:2] + np.append(np.zeros((1, 2)), np.cumsum(shift, axis=0), axis=0)
+    return np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
 
 
 @dataclass(frozen=True)
@@ -177,12 +175,10 @@ def _integrate_gyro(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Returns the gyro's turns (T - 1,) [rad] between times (T,), and whether it covers them."""
     span = np.diff(gyro_t)
-    total = np.concatenate(
-        [[0.0], np.cumsum(0.5 * (yaw_rate[1:] + yaw_rate[:-1]) * span)]
-    )
+    total = np.append(0.0, np.cumsum(0.5 * (yaw_rate[1:] + yaw_rate[:-1]) * span))
     turn = np.diff(np.interp(t, gyro_t, total))
     # Time without a gyro up to each moment; an interval that contains any is not covered.
-    lost = np.concatenate([[0.0], np.cumsum(np.where(span > LONGEST_GAP_S, span, 0.0))])
+    lost = np.append(0.0, np.cumsum(np.where(span > LONGEST_GAP_S, span, 0.0)))
     without = np.diff(np.interp(t, gyro_t, lost))
     inside = (t[:-1] >= gyro_t[0] - 1e-9) & (t[1:] <= gyro_t[-1] + 1e-9)
     return turn, np.asarray(inside & (without < 1e-9))
@@ -193,7 +189,7 @@ def _split_blocks(t: Array, pose: Array, gyro_t: Array, yaw_rate: Array) -> _Blo
     place = place[place < len(t)]
     at = t[place]
     heading = np.unwrap(pose[:, 2])
-    path = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T))])
+    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
     gyro_turn, covered = _integrate_gyro(at, gyro_t, yaw_rate)
     span = np.diff(at)
     usable = covered & (span > 0.5 * BLOCK_S) & (span < 2.0 * BLOCK_S)
@@ -220,23 +216,21 @@ def _estimate_bias(blocks: _Blocks) -> GyroBias:
     near = np.abs(rate - usual) <= max(5.0 * scatter, 1e-3)
     rate = rate[near]
     when = when[near]
-    bias, slope = _fit_drift(when, rate)
-    left = rate - bias - slope * (when - when.mean())
-    std = max(float(left.std() / np.sqrt(len(rate))), LEAST_BIAS_STD)
-    return GyroBias(bias, std, slope, float(when.mean()), rest_s)
-
-
-def _fit_drift(when: Array, rate: Array) -> tuple[float, float]:
-    """Returns the mean rate (n,) at rest, and its slope over time (n,); 0 if none shows."""
     bias = float(rate.mean())
-    if len(rate) < FEWEST_TO_DRIFT or float(np.ptp(when)) < DRIFT_SPAN_S:
-        return bias, 0.0
-    apart = when - when.mean()
-    power = float(apart @ apart)
-    slope = float(apart @ rate) / power
-    left = rate - bias - slope * apart
-    slope_std = max(float(left.std()), LEAST_BIAS_STD) / np.sqrt(power)
-    return bias, slope if abs(slope) >= DRIFTS * slope_std else 0.0
+    middle = float(when.mean())
+    left = rate - bias
+    slope = 0.0
+    if len(rate) >= FEWEST_TO_DRIFT and float(np.ptp(when)) >= DRIFT_SPAN_S:
+        apart = when - middle
+        power = float(apart @ apart)
+        fitted = float(apart @ rate) / power
+        unexplained = left - fitted * apart
+        slope_std = max(float(unexplained.std()), LEAST_BIAS_STD) / np.sqrt(power)
+        if abs(fitted) >= DRIFTS * slope_std:
+            slope = fitted
+            left = unexplained
+    std = max(float(left.std() / np.sqrt(len(rate))), LEAST_BIAS_STD)
+    return GyroBias(bias, std, slope, middle, rest_s)
 
 
 def _estimate_bias_while_driving(blocks: _Blocks) -> GyroBias:
@@ -246,14 +240,12 @@ def _estimate_bias_while_driving(blocks: _Blocks) -> GyroBias:
     coefficients, *_ = np.linalg.lstsq(chi, blocks.gyro_rate, rcond=None)
     residual = blocks.gyro_rate - chi @ coefficients
     variance = float(residual @ residual) / max(len(residual) - 2, 1)
-    noise = max(variance, LEAST_RATE_NOISE**2)
-    noise *= UNLIKE_BLOCKS**2
+    noise = UNLIKE_BLOCKS**2 * max(variance, LEAST_RATE_NOISE**2)
     usual = np.array([0.0, 1.0])
     deviation = np.array([USUAL_BIAS, USUAL_FACTOR])
     spread = np.linalg.inv(chi.T @ chi / noise + np.diag(deviation**-2.0))
     bias = (spread @ (chi.T @ blocks.gyro_rate / noise + usual / deviation**2))[0]
-    std = float(np.sqrt(spread[0, 0]))
-    std = max(std, LEAST_BIAS_STD)
+    std = max(float(np.sqrt(spread[0, 0])), LEAST_BIAS_STD)
     return GyroBias(float(bias), std, 0.0, float(blocks.middle.mean()), 0.0)
 
 
@@ -261,10 +253,10 @@ def _estimate_scale(
     odom_rate: Array, gyro_rate: Array, span: Array
 ) -> tuple[float, float, float]:
     """Returns odometry's turn per turn of the gyro, its deviation, and their correlation."""
-    turned = max(float((np.abs(rate) * span).sum()) for rate in (odom_rate, gyro_rate))
+    turned = max(float(np.abs(rate) @ span) for rate in (odom_rate, gyro_rate))
     power = float(gyro_rate @ gyro_rate)
     odom_power = float(odom_rate @ odom_rate)
-    if turned < LEAST_TURN_RAD or power == 0.0 or odom_power == 0.0:
+    if turned < LEAST_TURN_RAD or power * odom_power == 0.0:
         return np.nan, np.nan, np.nan
     together = float(odom_rate @ gyro_rate)
     scale = together / power
@@ -279,11 +271,12 @@ def _compute_rms(blocks: _Blocks, rate: Array, window_s: float) -> float:
     count = max(1, round(window_s / BLOCK_S))
     if len(turn) < count:
         return np.nan
-    total = np.concatenate([[0.0], np.cumsum(turn)])
+    total = np.append(0.0, np.cumsum(turn))
     sums = total[count:] - total[:-count]
     # A window across a gap contains less time than its length suggests.
-    end = blocks.middle + 0.5 * blocks.span
-    begin = blocks.middle - 0.5 * blocks.span
+    half = 0.5 * blocks.span
+    end = blocks.middle + half
+    begin = blocks.middle - half
     is_whole = end[count - 1 :] - begin[: len(sums)] < 1.5 * window_s
     if not is_whole.any():
         return np.nan

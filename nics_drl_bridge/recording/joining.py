@@ -6,8 +6,8 @@ training parts come first, so that one time separates them from the held-out par
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Any
+from itertools import chain
+from typing import Any, cast
 
 import numpy as np
 
@@ -43,24 +43,41 @@ def join(recordings: Sequence[Recording], offsets: Sequence[float] = ()) -> Reco
     have different clocks.
     """
     offsets = offsets or [0.0] * len(recordings)
-    aligned = [_align_clocks(*pair) for pair in zip(recordings, offsets, strict=True)]
-    _check_alike(aligned)
-    parts: list[_Part] = []
-    for recording in aligned:
-        parts += _split_recording(recording)
-    learnt = [part for part in parts if part.is_learnt]
-    held_out = [part for part in parts if not part.is_learnt]
-    return _place_parts(aligned, learnt, held_out)
+    drives = [_align_clocks(*pair) for pair in zip(recordings, offsets, strict=True)]
+    first = drives[0]
+    for drive in drives[1:]:
+        _check_alike(first, drive)
+    parts = list(chain.from_iterable(map(_split_recording, drives)))
+    parts.sort(key=lambda part: not part.is_learnt)
+    learnt = sum(part.is_learnt for part in parts)
+    shared = [
+        name for name in STREAMS if all(name in drive.streams for drive in drives)
+    ]
+    streams, episodes = _line_up(parts, shared)
+    lost = {*chain.from_iterable(drive.streams for drive in drives)}.difference(shared)
+    repairs = [_describe_join(parts, learnt < len(parts))]
+    for name in sorted(lost):
+        repairs.append(f"{name} was left out because not all recordings have it.")
+    for drive in drives:
+        repairs += drive.repairs
+    return replace(
+        first,
+        **cast(Any, dict.fromkeys(STREAMS) | streams),
+        source=", ".join(dict.fromkeys(drive.source for drive in drives)),
+        repairs=tuple(dict.fromkeys(repairs)),
+        robot=next((drive.robot for drive in drives if drive.robot is not None), None),
+        episodes=tuple(episodes),
+        learn_until_s=episodes[learnt - 1].end_s,
+    )
 
 
 def split_at(
     recording: Recording, starts: Sequence[float], names: Sequence[str]
 ) -> Recording:
     """Splits a recording into episodes that start at times [s] on the clock of its streams."""
-    ends = [*starts[1:], np.inf]
+    t = recording.pose.t
     parts = []
-    for start, end, name in zip(starts, ends, names, strict=True):
-        t = recording.pose.t
+    for start, end, name in zip(starts, [*starts[1:], np.inf], names, strict=True):
         pose = recording.pose.rows((t >= start) & (t < end))
         if len(pose.t) > 1:
             parts.append(replace(recording, pose=pose, source=name))
@@ -71,134 +88,97 @@ def split_at(
 
 def _align_clocks(recording: Recording, offset: float) -> Recording:
     pose = recording.pose
-    command = recording.command
-    if pose.clock == command.clock:
+    clock = recording.command.clock
+    if pose.clock == clock:
         return recording
     note = f"{recording.source}: the clock of its pose was aligned by {offset:.3f} s."
-    pose = replace(pose, t=pose.t + offset, clock=command.clock)
+    pose = replace(pose, t=pose.t + offset, clock=clock)
     return replace(recording, pose=pose, repairs=(*recording.repairs, note))
 
 
-def _check_alike(recordings: Sequence[Recording]) -> None:
-    """Refuses recordings of different robots (RecordingError)."""
-    first = recordings[0]
-    for recording in recordings[1:]:
-        counts = [drive.command.values.shape[1] for drive in (first, recording)]
-        if counts[0] != counts[1] or first.variables != recording.variables:
-            names = ", ".join(recording.variables) or f"{counts[1]} commands"
-            first_names = ", ".join(first.variables) or f"{counts[0]} commands"
-            raise RecordingError(
-                f"{recording.source}: has {names}, {first.source} has {first_names}; "
-                "join only drives of one robot, by one mapping."
-            )
+def _check_alike(first: Recording, other: Recording) -> None:
+    """Refuses a recording of another robot (RecordingError)."""
+    counts = [drive.command.values.shape[1] for drive in (first, other)]
+    if counts[0] != counts[1] or first.variables != other.variables:
+        names = ", ".join(other.variables) or f"{counts[1]} commands"
+        first_names = ", ".join(first.variables) or f"{counts[0]} commands"
+        raise RecordingError(
+            f"{other.source}: has {names}, {first.source} has {first_names}; join only "
+            "drives of one robot, by one mapping."
+        )
 
 
 def _split_recording(recording: Recording) -> list[_Part]:
     """Splits a recording into the part to learn from and the rest; episodes stay as they are."""
+    pose = recording.pose.t
     if recording.episodes:
         until = recording.learn_until_s
-        learnt_until = np.inf if until is None else float(recording.pose.t[0]) + until
+        learnt_until = np.inf if until is None else float(pose[0]) + until
         return [
             _Part(recording, e.start_s, e.end_s, e.start_s <= learnt_until, e.source)
             for e in recording.episodes
         ]
-    pose = recording.pose.t
+    source = recording.source
     begin = max(float(pose[0]), float(recording.command.t[0]))
     end = float(pose[-1])
     if not begin < end:
         raise RecordingError(
-            f"{recording.source}: its commands and poses share no time; check that "
-            "they are of one drive."
+            f"{source}: its commands and poses share no time; check that they are of "
+            "one drive."
         )
     if end - begin < SHORTEST_SPLIT_S:
-        return [_Part(recording, begin, end, True, recording.source)]
+        return [_Part(recording, begin, end, True, source)]
     middle = begin + LEARNT_SHARE * (end - begin)
     last = float(pose[pose <= middle][-1])
     first = float(pose[pose > middle][0])
     return [
-        _Part(recording, begin, last, True, recording.source),
-        _Part(recording, first, end, False, recording.source),
+        _Part(recording, begin, last, True, source),
+        _Part(recording, first, end, False, source),
     ]
-
-
-def _place_parts(
-    recordings: Sequence[Recording], learnt: Sequence[_Part], held_out: Sequence[_Part]
-) -> Recording:
-    """Arranges parts on one time axis; each pose begins where the previous one ended."""
-    shared = [
-        name for name in STREAMS if all(name in drive.streams for drive in recordings)
-    ]
-    parts = (*learnt, *held_out)
-    streams, episodes = _line_up(parts, shared)
-    joined: dict[str, Any] = dict.fromkeys(STREAMS)
-    joined |= {name: _append_streams(name, some) for name, some in streams.items()}
-    sources = list(dict.fromkeys(part.source for part in parts))
-    robots = [drive.robot for drive in recordings if drive.robot is not None]
-    return replace(
-        recordings[0],
-        **joined,
-        source=", ".join(dict.fromkeys(drive.source for drive in recordings)),
-        repairs=(
-            _describe_join(sources, bool(held_out)),
-            *_collect_repairs(recordings, shared),
-        ),
-        robot=next(iter(robots), None),
-        episodes=tuple(episodes),
-        learn_until_s=episodes[len(learnt) - 1].end_s,
-    )
 
 
 def _line_up(
     parts: Sequence[_Part], names: Sequence[str]
-) -> tuple[dict[str, list[Stream]], list[Episode]]:
-    """Returns the streams of parts one after another, by name, and the parts as episodes."""
+) -> tuple[dict[str, Stream], list[Episode]]:
+    """Returns the streams of parts one after another, by name, and the parts as episodes.
+
+    Each pose begins where the previous one ended.
+    """
     streams: dict[str, list[Stream]] = {name: [] for name in names}
     episodes = []
     start = 0.0
     place = np.zeros(3)
     for part in parts:
         shift = start - part.start_s
-        cut = _cut_part(part, names)
-        cut["pose"] = _move_pose(cut["pose"], place)
-        place = cut["pose"].values[-1]
-        for name, stream in cut.items():
+        for name in names:
+            stream = _cut_stream(name, part)
+            if name == "pose":
+                stream = _move_pose(stream, place)
+                place = stream.values[-1]
             streams[name].append(replace(stream, t=stream.t + shift))
         episodes.append(Episode(part.source, start, part.end_s + shift))
         start = part.end_s + shift + APART_S
-    return streams, episodes
+    return {name: _append_streams(some) for name, some in streams.items()}, episodes
 
 
-def _cut_part(part: _Part, names: Sequence[str]) -> dict[str, Stream]:
-    """Returns the streams of a part, with further commands before and after it."""
-    cut = {}
-    for name in names:
-        stream = part.recording.streams[name]
-        if name == "command":
-            cut[name] = _cut_commands(stream, part)
-            continue
-        rows = (stream.t >= part.start_s) & (stream.t <= part.end_s)
-        if rows.sum() < 2:
-            raise RecordingError(
-                f"{part.source}: has no {name} between {part.start_s:.1f} and "
-                f"{part.end_s:.1f} s; remove this recording, or its {name}."
-            )
-        cut[name] = stream.rows(rows)
-    return cut
-
-
-def _cut_commands(command: Stream, part: _Part) -> Stream:
-    """Returns a part's commands, and before them the one in effect, so that states can settle."""
-    lead = part.start_s - LEAD_S
-    first = max(int(np.searchsorted(command.t, lead, side="right")) - 1, 0)
-    last = int(np.searchsorted(command.t, part.end_s + AFTER_S, side="right"))
-    rows = command.rows(slice(first, max(last, first + 1)))
-    t = np.maximum(rows.t, lead)
-    t = np.append(t[0] - SETTLE_S, t)
-    values = np.concatenate([rows.values[:1], rows.values])
-    sigma = rows.sigma
-    if sigma is not None:
-        sigma = np.concatenate([sigma[:1], sigma])
-    return replace(rows, t=t, values=values, sigma=sigma)
+def _cut_stream(name: str, part: _Part) -> Stream:
+    """Returns a stream of a part; commands begin before it, so that states can settle."""
+    stream = part.recording.streams[name]
+    if name == "command":
+        lead = part.start_s - LEAD_S
+        first = max(int(np.searchsorted(stream.t, lead, side="right")) - 1, 0)
+        last = int(np.searchsorted(stream.t, part.end_s + AFTER_S, side="right"))
+        commands = stream.rows(np.r_[first, first : max(last, first + 1)])
+        t = np.maximum(commands.t, lead)
+        t[0] -= SETTLE_S
+        return replace(commands, t=t)
+    rows = (stream.t >= part.start_s) & (stream.t <= part.end_s)
+    if rows.sum() < 2:
+        raise RecordingError(
+            f"{part.source}: has no {name} between {part.start_s:.1f} and "
+            f"{part.end_s:.1f} s; remove this recording, or its {name}."
+        )
+    return stream.rows(rows)
 
 
 def _move_pose(pose: Stream, place: Array) -> Stream:
@@ -214,29 +194,23 @@ def _move_pose(pose: Stream, place: Array) -> Stream:
     cosine = np.cos(place[2] - first[2])
     sine = np.sin(place[2] - first[2])
     x, y, heading = pose.sigma.T
-    moved_x = np.hypot(cosine * x, sine * y)
-    moved_y = np.hypot(sine * x, cosine * y)
-    sigma = np.stack([moved_x, moved_y, heading], axis=1)
-    return replace(pose, values=values, sigma=sigma)
+    sigma = [np.hypot(cosine * x, sine * y), np.hypot(sine * x, cosine * y), heading]
+    return replace(pose, values=values, sigma=np.stack(sigma, axis=1))
 
 
-def _append_streams(name: str, parts: Sequence[Stream]) -> Stream:
+def _append_streams(parts: Sequence[Stream]) -> Stream:
     """Appends streams; deviations are kept only if all of them have some."""
-    for before, after in pairwise(parts):
-        if after.t[0] < before.t[-1]:
-            raise RecordingError(
-                f"{name}: two episodes overlap in time; please report this bug."
-            )
-    sigma = None
     sigmas = [part.sigma for part in parts if part.sigma is not None]
-    if len(sigmas) == len(parts):
-        sigma = np.concatenate(sigmas)
-    t = np.concatenate([part.t for part in parts])
-    values = np.concatenate([part.values for part in parts])
-    return Stream(t, values, parts[0].clock, sigma)
+    return Stream(
+        np.concatenate([part.t for part in parts]),
+        np.concatenate([part.values for part in parts]),
+        parts[0].clock,
+        np.concatenate(sigmas) if len(sigmas) == len(parts) else None,
+    )
 
 
-def _describe_join(sources: Sequence[str], is_split: bool) -> str:
+def _describe_join(parts: Sequence[_Part], is_split: bool) -> str:
+    sources = list(dict.fromkeys(part.source for part in parts))
     names = f"{sources[0]} to {sources[-1]}"
     if len(sources) <= 10:
         names = ", ".join(sources)
@@ -247,19 +221,3 @@ def _describe_join(sources: Sequence[str], is_split: bool) -> str:
         f"{len(sources)} drives were joined ({names}): {split}; no prediction crosses "
         "over."
     )
-
-
-def _collect_repairs(
-    recordings: Sequence[Recording], shared: Sequence[str]
-) -> tuple[str, ...]:
-    lost: set[str] = set()
-    for recording in recordings:
-        lost.update(recording.streams)
-    lost.difference_update(shared)
-    repairs = [
-        f"{name} was left out because not all recordings have it."
-        for name in sorted(lost)
-    ]
-    for recording in recordings:
-        repairs += recording.repairs
-    return tuple(dict.fromkeys(repairs))

@@ -1,6 +1,6 @@
 """Reads the streams of a recording in any format according to its mapping."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -31,7 +31,7 @@ from nics_drl_bridge.recording.recording import (
     check_streams,
     find_implausible_pose,
 )
-from nics_drl_bridge.recording.table import Column, Source, Table, read_numbers
+from nics_drl_bridge.recording.table import Source, Table, read_numbers
 from nics_drl_bridge.recording.topic_roles import guess_source_by_names
 from nics_drl_bridge.recording.values import (
     MappedReader,
@@ -80,9 +80,9 @@ class _Episode(Source):
     """The rows of one episode in a table that holds everything that a mapping reads."""
 
     def __init__(
-        self, place: str, name: str, table: Table, rows: NDArray[np.intp]
+        self, source: Source, place: str, table: Table, rows: NDArray[np.intp]
     ) -> None:
-        super().__init__(place, [name])
+        super().__init__(place, source.names)
         self._table = replace(
             table,
             place=place,
@@ -95,14 +95,6 @@ class _Episode(Source):
         return self._table
 
 
-def _is_only_table(reader: MappedReader, mapping: DriveMapping, table: Table) -> bool:
-    pose = mapping.pose
-    values = (*mapping.command.values(), *mapping.state.values())
-    used = [reader.locate(value.from_)[0] for value in values]
-    used.append(reader.locate(pose.x.from_ if pose.x else 0, pose.in_)[0])
-    return all(other is table for other in used)
-
-
 def _split_table(
     source: Source, mapping: DriveMapping, episode: Reference
 ) -> list[tuple[str, Source]]:
@@ -113,28 +105,28 @@ def _split_table(
     """
     reader = MappedReader(source, mapping)
     table, reference = reader.locate(episode)
+    pose = mapping.pose
+    used = [reader.locate(pose.x.from_ if pose.x else 0, pose.in_)[0]]
+    for value in (*mapping.command.values(), *mapping.state.values()):
+        used.append(reader.locate(value.from_)[0])
     # Stamps that come with the rows continue from one episode to the next.
-    if not _is_only_table(reader, mapping, table) or table.stamps("") is not None:
+    if any(each is not table for each in used) or table.stamps("") is not None:
         return []
-    name = next(name for name in source.names if source.get_table(name) is table)
     episodes: list[tuple[str, Source]] = []
-    for label, rows in _group_rows(table.column(reference)):
+    column = table.column(reference)
+    _, firsts, groups = np.unique(column, return_index=True, return_inverse=True)
+    for k in np.argsort(firsts):
+        rows = np.flatnonzero(groups == k)
         if len(rows) >= MIN_EPISODE_ROWS:
+            label = _format_label(column[firsts[k]])
             place = f"{source.place} (episode {label})"
-            episodes.append((label, _Episode(place, name, table, rows)))
+            episodes.append((label, _Episode(source, place, table, rows)))
     if not episodes:
         raise ConfigError(
             f"{table.place}: no value of the column {reference!r} lasts for "
             f"{MIN_EPISODE_ROWS} rows; name the column that numbers the episodes."
         )
     return episodes
-
-
-def _group_rows(column: Column) -> Iterator[tuple[str, NDArray[np.intp]]]:
-    """Yields each value of a column with its rows, in order of appearance."""
-    _, first, group = np.unique(column, return_index=True, return_inverse=True)
-    for k in np.argsort(first):
-        yield _format_label(column[first[k]]), np.flatnonzero(group == k)
 
 
 def _split_by_time(
@@ -193,9 +185,10 @@ def _read_drive(
             streams[name] = _read_turn_rate(reader, measured, measured.heading)
         elif measured is not None:
             streams[name] = _read_measured(reader, name, measured)
-    streams = {
-        name: _drop_repeats(reader, name, stream) for name, stream in streams.items()
-    }
+    for name, stream in streams.items():
+        is_new, note = stamping.select_new_rows(stream.t, stream.values, name)
+        reader.add_notes(note)
+        streams[name] = stream.rows(is_new)
     recording = Recording(
         **cast(Any, streams),
         source=source.place,
@@ -208,13 +201,6 @@ def _read_drive(
     shifted: Any = _shift_to_zero(streams, mapping.clock or schema.ROBOT_CLOCK, reader)
     origin_s = float(streams["pose"].t[0] - shifted["pose"].t[0])
     return replace(recording, **shifted, repairs=tuple(reader.notes)), origin_s
-
-
-def _drop_repeats(reader: MappedReader, name: str, stream: Stream) -> Stream:
-    """Leaves out rows that repeat the previous one, including its stamp."""
-    is_new, note = stamping.select_new_rows(stream.t, stream.values, name)
-    reader.add_notes(note)
-    return stream.rows(is_new)
 
 
 def _read_values(
@@ -356,9 +342,7 @@ def _read_command_topic(reader: MappedReader, topic: str, spec: RobotSpec) -> St
                 f"robot {spec.name!r} is in {variable.unit}; choose the recorded "
                 "robot, or another topic."
             )
-    values = {
-        field: Value.model_validate({"from": f"{topic}:{field}"}) for field in fields
-    }
+    values = {field: _read_plainly(f"{topic}:{field}") for field in fields}
     stream = _read_values(reader, "command", values, held=True)
     if not is_steered:
         return replace(stream, values=spec.from_cmd_vel(stream.values))
@@ -414,10 +398,7 @@ def _read_heading(
     """Returns the headings of quaternions, without quaternions of length 0."""
     if isinstance(references, str):
         references = [f"{references}.{axis}" for axis in "xyzw"]
-    values = {
-        axis: Value.model_validate({"from": reference})
-        for axis, reference in zip("xyzw", references, strict=True)
-    }
+    values = dict(zip("xyzw", map(_read_plainly, references), strict=True))
     stream = _read_values(reader, "pose.quaternion", values, False, pose)
     place = f"{reader.source.place}: pose"
     length = np.linalg.norm(stream.values, axis=1)
@@ -437,14 +418,7 @@ def _read_heading(
         )
     if recordings.is_w_first(stream.values):
         raise RecordingError(f"{place}: {recordings.W_FIRST}.")
-    _check_tilt(stream.values, place)
-    headings = recordings.compute_heading(*stream.values.T)
-    return Series(stream.t, headings, stream.clock)
-
-
-def _check_tilt(quaternions: Array, place: str) -> None:
-    """Raises RecordingError for a body that, by its quaternions (T, 4), does not stand upright."""
-    x, y, _, _ = quaternions.T
+    x, y, z, w = stream.values.T
     cosine = np.clip(np.abs(1.0 - 2.0 * (x * x + y * y)), 0.0, 1.0)
     tilt = np.degrees(np.median(np.arccos(cosine)))
     if tilt > MOST_TILT_DEG:
@@ -452,6 +426,13 @@ def _check_tilt(quaternions: Array, place: str) -> None:
             f"{place}: by its quaternion the body is tilted by {tilt:.0f} deg; list "
             "its columns in the order x, y, z, w, or, if y is up, as [qz, qx, qy, qw]."
         )
+    headings = recordings.compute_heading(x, y, z, w)
+    return Series(stream.t, headings, stream.clock)
+
+
+def _read_plainly(reference: Reference) -> Value:
+    """Returns a value that is read as it is."""
+    return Value.model_validate({"from": reference})
 
 
 POSES = (
@@ -485,19 +466,6 @@ def _complete_pose(reader: MappedReader, pose: PoseSource) -> PoseSource:
     )
 
 
-def _list_covariances(
-    reader: MappedReader, pose: PoseSource, reference: str
-) -> list[str]:
-    """Returns the elements of a field that is a covariance. Raises RecordingError."""
-    table, field = reader.locate(reference, pose.in_)
-    count = sum(name.startswith(f"{field}[") for name in table.names)
-    if count not in schema.COVARIANCES:
-        raise RecordingError(
-            f"{table.place}: {field!r} has {count} numbers; a covariance has 3, 9 or 36."
-        )
-    return [f"{reference}[{k}]" for k in range(count)]
-
-
 def _read_deviations(
     reader: MappedReader,
     pose: PoseSource,
@@ -506,10 +474,16 @@ def _read_deviations(
 ) -> Array | None:
     """Returns standard deviations (T, 3) from variances or a matrix; None if none is known."""
     if isinstance(references, str):
-        references = _list_covariances(reader, pose, references)
+        table, field = reader.locate(references, pose.in_)
+        count = sum(name.startswith(f"{field}[") for name in table.names)
+        if count not in schema.COVARIANCES:
+            raise RecordingError(
+                f"{table.place}: {field!r} has {count} numbers; a covariance has 3, 9 or 36."
+            )
+        references = [f"{references}[{k}]" for k in range(count)]
     columns = []
     for k in schema.COVARIANCES[len(references)]:
-        value = Value.model_validate({"from": references[k]})
+        value = _read_plainly(references[k])
         series = reader.read_series(
             "pose.covariance", value, pose, held=False, allow_infinite=True
         )
@@ -536,15 +510,10 @@ def _shift_to_zero(
     spans = _find_spans(streams, reader.source.place)
     _check_durations(streams, reader.source.place)
     start, stop = spans.get(main_clock) or next(iter(spans.values()))
-    overlapping = {
-        clock: first
-        for clock, (first, last) in spans.items()
-        if first <= stop and last >= start
-    }
-    common = min(overlapping.values())
-    origins = dict.fromkeys(spans, common)
-    for clock, (first, _) in spans.items():
-        if clock not in overlapping:
+    overlapping = [a for a, b in spans.values() if a <= stop and b >= start]
+    origins = dict.fromkeys(spans, min(overlapping))
+    for clock, (first, last) in spans.items():
+        if first > stop or last < start:
             origins[clock] = first
             reader.add_notes(
                 f"The clock {clock!r} was set to 0 at its first stamp, {first:.3f} s."

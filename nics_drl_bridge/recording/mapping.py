@@ -1,6 +1,7 @@
 """DriveMapping: which column or message field of a recording is which stream, and in what unit."""
 
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -8,7 +9,6 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, load_yaml
 from nics_drl_bridge.errors import suggest
-from nics_drl_bridge.recording.names import split_words, word_set
 
 TURN = 2.0 * math.pi
 
@@ -83,19 +83,29 @@ RATES = {
 }
 
 
+def word_set(text: str) -> frozenset[str]:
+    """Returns the words of a text, split at white space."""
+    return frozenset(text.split())
+
+
+def split_words(name: str) -> list[str]:
+    """Splits a name into its words: `vicon x`, `q.x`, `Left_Tick`, `cmdVel`."""
+    parts = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
+    return [word for word in re.split(r"[^A-Za-z]+", parts.lower()) if word]
+
+
+def write_reference(reference: str) -> str:
+    """Returns a reference as YAML that is also valid within a list."""
+    plain = re.fullmatch(r"[A-Za-z/][\w/. -]*(:[\w. -]+)?|\d+", reference)
+    is_word = reference.lower() not in ("true", "false", "null")
+    return reference if plain and is_word else f'"{reference}"'
+
+
 def check_unit(name: str) -> str:
     """Returns the name of a unit. Raises ValueError with a suggestion if it is unknown."""
     if str(name) not in UNITS:
         raise ValueError(f"is no known unit ({suggest(str(name), UNITS)})")
     return str(name)
-
-
-def to_si(unit: str, ticks_per_turn: float | None) -> UnitOfData:
-    """Returns the SI unit and the factor of a unit; ticks are angles if their count is known."""
-    si = UNITS[unit].si
-    if si in TICKS and ticks_per_turn:
-        return UnitOfData(TICKS[si], TURN / ticks_per_turn)
-    return UNITS[unit]
 
 
 # Words of columns that can't be commands: positions on Earth, and uncertainties

@@ -1,11 +1,11 @@
 """Drafts a recording's mapping from its names, units and types, with blanks for the rest."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
 
-from nics_drl_bridge.geometry import Array, east_and_north
+from nics_drl_bridge.geometry import east_and_north
 from nics_drl_bridge.recording.column_guesses import (
     GLOBE,
     Candidate,
@@ -23,9 +23,12 @@ from nics_drl_bridge.recording.column_guesses import (
     write_value,
 )
 from nics_drl_bridge.recording.mapped import POSES
-from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.names import split_words, write_reference
-from nics_drl_bridge.recording.recording import compute_heading, find_implausible_pose
+from nics_drl_bridge.recording.mapping import UNITS, write_reference
+from nics_drl_bridge.recording.recording import (
+    Implausible,
+    compute_heading,
+    find_implausible_pose,
+)
 from nics_drl_bridge.recording.survey import Field, TableSurvey
 
 GUESSED = "# guessed"
@@ -62,79 +65,52 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
     pose = guess_pose(tables)
     guess = guess_command(tables, pose)
     switches = guess_switches(tables) if guess.listed else ()
-    used = [command.column for command in guess.listed.values()]
+    used = [candidate.column for candidate in guess.listed.values()]
+    used += [switch.column for switch in switches]
     gyro = guess_yaw_rate(tables)
     if gyro in used:
         gyro = None
     episode = guess_episode(tables)
-    time = _choose_time(tables)
-    lines = [_write_robot(guess), *_write_time(tables, time)]
+    times = [table.time for table in tables if table.time is not None]
+    time = max(times, key=times.count, default=None)
+    lines = [_write_robot(guess.kind)]
+    if time is not None:
+        lines.append(f"time: {time}  {GUESSED}")
+    elif any(table.t is None and table.rows for table in tables):
+        lines.append(
+            f"time: {{rate: 50}}  {GUESSED}: no stamps were found; rows a second"
+        )
     if episode is not None:
         lines.append(f"episode: {episode.reference}  {GUESSED}")
-        used.append(episode)
-    poses = None
+    doubts = []
     if pose is None:
         lines += [NO_POSE, "pose:", "  x: ", "  y: "]
     else:
         units = _name_units(pose)
-        poses = _compute_poses(pose, units)
-        lines += _write_pose(pose, units, time)
-        lines += _write_clock(pose, guess.listed)
+        lines += [*_write_pose(pose, units, time), *_write_clock(pose, guess.listed)]
+        fault = _find_fault(pose, units, guess.kind)
+        if fault is not None:
+            line = fault.line.replace("...", str(time))
+            doubts.append(f"pose: {fault.reason}; {fault.cause}: add `{line}`")
+    if not guess.listed:
+        doubts.append(NO_COMMAND)
     lines += _write_commands(guess, switches, time)
     if gyro is not None:
         lines.append(f"{write_imu_line(gyro, time)}  {GUESSED}")
-        used.append(gyro)
-    used += [command.column for command in guess.candidates.values()]
-    used += [switch.column for switch in switches]
-    return MappingDraft(
-        doubts=[*_find_doubts(guess, poses, str(time))],
-        lines=lines,
-        unused=[*_list_unused(tables, used, pose)],
-    )
+    used += [candidate.column for candidate in guess.candidates.values()]
+    unused = [*_list_unused(tables, {*used, episode, gyro}, pose)]
+    return MappingDraft(doubts, lines, unused)
 
 
-def _choose_time(tables: Sequence[TableSurvey]) -> str | None:
-    """Returns the stamps of most tables, which are those of the whole mapping."""
-    times = [table.time for table in tables if table.time is not None]
-    return max(times, key=times.count, default=None)
-
-
-def _write_time(tables: Sequence[TableSurvey], time: str | None) -> Iterator[str]:
-    """Yields the line for the stamps of most tables, or for rows without stamps."""
-    if time is not None:
-        yield f"time: {time}  {GUESSED}"
-    elif any(table.t is None and table.rows for table in tables):
-        yield f"time: {{rate: 50}}  {GUESSED}: no stamps were found; rows a second"
-
-
-def _find_doubts(
-    guess: CommandGuess, poses: tuple[Array, Array] | None, time: str
-) -> Iterator[str]:
-    """Yields a sentence on a pose in the wrong unit, and one if no command was recorded.
-
-    `time` is the reference to the column of the stamps.
-    """
-    if poses is not None:
-        # A car may accelerate harder than a small robot; only the kind distinguishes them.
-        may_be_car = guess.kind is None or guess.kind.startswith("ackermann")
-        radius = np.inf if may_be_car else USUAL_RADIUS
-        fault = find_implausible_pose(*poses, radius=radius)
-        if fault is not None:
-            line = fault.line.replace("...", time)
-            yield f"pose: {fault.reason}; {fault.cause}: add `{line}`"
-    if not guess.listed:
-        yield NO_COMMAND
-
-
-def _write_robot(guess: CommandGuess) -> str:
-    if guess.kind is None:
+def _write_robot(kind: str | None) -> str:
+    if kind is None:
         return (
             "robot:  # the kind is not certain, for example {kind: differential, "
             f"footprint_radius: {USUAL_RADIUS}}}"
         )
-    look_alikes = "".join(f", or {kind}" for kind in find_look_alikes(guess.kind))
+    look_alikes = "".join(f", or {other}" for other in find_look_alikes(kind))
     return (
-        f"robot: {{kind: {guess.kind}, footprint_radius: {USUAL_RADIUS}}}  "
+        f"robot: {{kind: {kind}, footprint_radius: {USUAL_RADIUS}}}  "
         f"{GUESSED}{look_alikes}; radius in m"
     )
 
@@ -204,19 +180,17 @@ def _write_clock(pose: PoseGuess, commands: Mapping[str, Candidate]) -> Iterator
 
 
 def _list_unused(
-    tables: Sequence[TableSurvey], used: Sequence[Field], pose: PoseGuess | None
+    tables: Sequence[TableSurvey], used: Set[Field | None], pose: PoseGuess | None
 ) -> Iterator[str]:
     """Yields a text for each table with the columns of values that the draft does not use."""
     for table in tables:
         unused = []
         for column in table.columns:
-            is_value = NO_VALUES.isdisjoint(split_words(column.name))
-            if not is_value or column in used or is_used(column, pose):
+            if column.name_words & NO_VALUES or column in used or is_used(column, pose):
                 continue
-            remark = ""
-            if not column.moves:
-                is_constant = column.low == column.high
-                remark = " (constant)" if is_constant else " (no numbers)"
+            remark = "" if column.moves else " (no numbers)"
+            if column.low == column.high:
+                remark = " (constant)"
             unused.append(f"{column.name}{remark}")
         place = "" if table.is_single else f"{table.name}: "
         listed = ", ".join(unused[:MOST_LISTED])
@@ -238,7 +212,7 @@ def _write_pose(
         lines.append(f"  in: {write_reference(table.name)}")
     names = [write_reference(column.name) for column in pose.columns]
     lines += [f"  x: {names[0]}", f"  y: {names[1]}"]
-    if pose.heading is not None:
+    if len(pose.orientation) == 1:
         lines.append(f"  heading: {names[2]}")
     else:
         lines.append(f"  quaternion: [{', '.join(names[2:])}]")
@@ -252,10 +226,10 @@ def _write_pose(
 def _name_units(pose: PoseGuess) -> dict[str, str]:
     """Returns the units that the names of a pose's columns show, unless they are m and rad."""
     units = {"unit": pose.x.unit}
-    if not {*GLOBE}.isdisjoint(split_words(pose.x.name)):
+    if pose.x.name_words & GLOBE.keys():
         units["unit"] = "deg"
-    if pose.heading is not None:
-        units["heading_unit"] = pose.heading.unit
+    if len(pose.orientation) == 1:
+        units["heading_unit"] = pose.orientation[0].unit
     return {
         key: unit
         for key, unit in units.items()
@@ -263,10 +237,10 @@ def _name_units(pose: PoseGuess) -> dict[str, str]:
     }
 
 
-def _compute_poses(
-    pose: PoseGuess, units: Mapping[str, str]
-) -> tuple[Array, Array] | None:
-    """Returns stamps (T,) and poses (T, 3) of a guess in SI; None if its rows have no stamps."""
+def _find_fault(
+    pose: PoseGuess, units: Mapping[str, str], kind: str | None
+) -> Implausible | None:
+    """Finds poses that only another unit explains; None also if their rows have no stamps."""
     t = pose.table.t
     columns = [column.numbers for column in pose.columns]
     # The columns may be of several streams.
@@ -274,15 +248,17 @@ def _compute_poses(
         return None
     x, y, *orientation = columns
     heading = orientation[0]
-    if pose.quaternion:
+    if len(orientation) > 1:
         heading = compute_heading(*orientation)
-    values = np.stack([x, y, heading], axis=1)
-    is_finite = np.isfinite(values).all(axis=1)
-    if is_finite.sum() < 3:
-        return None
-    values[:, 2] *= UNITS[units.get("heading_unit", "rad")].factor
     si, factor = UNITS[units.get("unit", "m")]
-    values[:, :2] *= factor
+    place = (factor * x, factor * y)
     if si == "rad":
-        values[:, :2] = np.stack(east_and_north(*values[:, :2].T), axis=1)
-    return t[is_finite], values[is_finite]
+        place = east_and_north(*place)
+    heading = heading * UNITS[units.get("heading_unit", "rad")].factor
+    values = np.stack([*place, heading], axis=1)
+    is_finite = np.isfinite(values).all(axis=1)
+    # A car may accelerate harder than a small robot; only the kind distinguishes them.
+    radius = USUAL_RADIUS
+    if kind is None or kind.startswith("ackermann"):
+        radius = np.inf
+    return find_implausible_pose(t[is_finite], values[is_finite], radius=radius)

@@ -35,9 +35,7 @@ AnyMapping = DriveMapping | TopicRoles | str | Path | None
 
 
 def open_drive(
-    source: str | Path,
-    robot: RobotSpec | str | None = None,
-    mapping: AnyMapping = None,
+    source: str | Path, robot: RobotSpec | str | None = None, mapping: AnyMapping = None
 ) -> tuple[RobotSpec, Recording]:
     """Opens a drive with its robot, by a mapping, its file, or the roles of a bag's topics.
 
@@ -224,11 +222,9 @@ def _check_units_fit_robot(mapping: DriveMapping, spec: RobotSpec) -> None:
                 continue  # a scaled value may be in the robot's unit
             si = get_unit(value).si
             if si and si != variable.unit != "1":
-                turns = si.startswith("ticks") and variable.unit.startswith("rad")
-                if turns:
+                cure = "check its unit, or give `scale:`"
+                if si.startswith("ticks") and variable.unit.startswith("rad"):
                     cure = "add `ticks_per_turn:`, the counts of a turn of the wheel"
-                else:
-                    cure = "check its unit, or give `scale:`"
                 raise ConfigError(
                     f"{stream}.{variable.name}: is in {si}, where {variable.unit} is "
                     f"needed; {cure}."
@@ -261,12 +257,10 @@ def reorder_variables(recording: Recording, spec: RobotSpec) -> Recording:
         return check(recording, spec)
     count = recording.command.values.shape[1]
     made: dict[str, Any] = {}
-    parts = {
-        "command": (slice(-count, None), spec.command),
-        "state": (slice(-count), spec.state),
-    }
-    for part, (place, variables) in parts.items():
-        recorded = recording.variables[place]
+    for part, recorded, variables in (
+        ("command", recording.variables[-count:], spec.command),
+        ("state", recording.variables[:-count], spec.state),
+    ):
         names = [variable.name for variable in variables]
         stream = recording.streams.get(part)
         if stream is None:

@@ -2,7 +2,6 @@
 
 import io
 import json
-import zipfile
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -217,23 +216,16 @@ def samples_on_one_clock(
     )
 
 
-def _check_types(recording: object, spec: object) -> None:
-    """Raises ConfigError for a path or a name instead of the object."""
-    if not isinstance(recording, Recording):
-        raise ConfigError(
-            f"recording={format_value(recording)}: must be a Recording, as "
-            "read_recording(path) returns."
-        )
-    if not isinstance(spec, RobotSpec):
-        raise ConfigError(
-            f"robot={format_value(spec)}: must be a RobotSpec, as load_robot(name) "
-            "returns."
-        )
-
-
 def check(recording: Recording, spec: RobotSpec) -> Recording:
     """Returns a recording that fits a robot. Raises RecordingError with place and fault if not."""
-    _check_types(recording, spec)
+    for word, value, kind, source in (
+        ("recording", recording, Recording, "a Recording, as read_recording(path)"),
+        ("robot", spec, RobotSpec, "a RobotSpec, as load_robot(name)"),
+    ):
+        if not isinstance(value, kind):
+            raise ConfigError(
+                f"{word}={format_value(value)}: must be {source} returns."
+            )
     names = spec.variable_names
     recorded = recording.variables
     if recording.state is None:  # then only the order of the commands matters
@@ -249,8 +241,8 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
     check_streams(
         recording, {"command": len(spec.command), "state": len(spec.state), "wheels": 2}
     )
-    speeds = [v for v in spec.command if v.unit == "m/s"]
-    fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
+    speeds = [max(-v.min, v.max) for v in spec.command if v.unit == "m/s"]
+    fastest = max(speeds, default=np.inf)
     pose = recording.pose
     radius = spec.footprint_radius
     fault = find_implausible_pose(pose.t, pose.values, fastest, radius)
@@ -335,9 +327,13 @@ def load_recording(path: str | Path) -> Recording:
                 "the version of the package that wrote it."
             )
         files.check_sealed(io.BytesIO(data))
-        streams: Any = {
-            n: _read_stream(arrays, n, clock) for n, clock in meta["clocks"].items()
-        }
+        streams: Any = {}
+        for name, clock in meta["clocks"].items():
+            sigma = arrays.get(f"{name}_sigma")
+            if sigma is not None:
+                sigma = sigma.astype(float)
+            t = arrays[f"{name}_t"].astype(float)
+            streams[name] = Stream(t, arrays[name].astype(float), clock, sigma)
         measured_by = meta.get("measured_by", "")
         if measured_by not in get_args(MeasuredBy):
             raise ValueError(f"measured_by is {measured_by!r}")
@@ -376,21 +372,10 @@ def is_recording(path: Path) -> bool:
         return False
 
 
-def _read_stream(arrays: dict[str, NDArray[Any]], name: str, clock: str) -> Stream:
-    t = arrays[f"{name}_t"].astype(float)
-    values = arrays[name].astype(float)
-    sigma = arrays.get(f"{name}_sigma")
-    if sigma is not None:
-        sigma = sigma.astype(float)
-    return Stream(t, values, clock, sigma)
-
-
 def _read_arrays(data: bytes) -> dict[str, NDArray[Any]]:
     """Returns the arrays of an `.npz` file. Raises ValueError if it is damaged or too large."""
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-        if size > files.MOST_BYTES:
+        if files.count_unpacked(io.BytesIO(data)) > files.MOST_BYTES:
             raise ValueError(
                 f"unpacked it is larger than {files.MOST_BYTES // 2**20} MB"
             )
@@ -418,49 +403,45 @@ def find_implausible_pose(
     """
     if len(t) < 3:
         return None
-    hardest = HARDEST_OF_CARS
-    if radius < SMALL_M:
-        hardest = HARDEST
-    return (
-        _find_too_slow(t)
-        or _find_degrees(t, pose)
-        or _find_wrong_degrees(pose[_select_spaced(t)])
-        or _find_too_fast(t, pose, fastest, hardest)
-    )
+    unit = guess_time_unit(t)
+    if unit is not None:
+        reason = f"there are {np.median(np.diff(t)):.3g} s between samples"
+        cause = f"stamps must be in seconds ({UNITS_OF_STEP[unit]} look like this)"
+        return Implausible(reason, cause, f"time: {{from: ..., unit: {unit}}}")
+    degrees = _find_degrees(t, pose)
+    if degrees is not None:
+        return degrees
+    spaced = _select_spaced(t)
+    pose = pose[spaced]
+    if _is_only_along(pose, 180.0 / np.pi):
+        largest = f"the heading is up to {np.abs(pose[:, 2]).max():.2g} rad"
+        reason = f"{largest}, and the path follows 57 times that angle"
+        cause = "it was in radians, but is read as degrees"
+        return Implausible(reason, cause, "heading_unit: rad")
+    hardest = HARDEST if radius < SMALL_M else HARDEST_OF_CARS
+    return _find_too_fast(t[spaced], pose, fastest, hardest)
 
 
 def _find_degrees(t: Array, pose: Array) -> Implausible | None:
     heading = pose[:, 2]
-    cause = "it must be in radians (degrees look like this)"
-    turn = np.percentile(np.abs(geometry.wrap_angle(np.diff(heading))), 95)
+    largest = np.abs(heading).max()
+    step = np.diff(heading)
+    turn = np.percentile(np.abs(geometry.wrap_angle(step)), 95)
+    reason = f"the heading is up to {largest:.4g} rad"
     if turn > LARGEST_TURN:
         reason = f"the heading jumps by {turn:.1f} rad between neighbouring samples"
-        return Implausible(reason, cause, "heading_unit: deg")
-    if np.abs(heading).max() <= 2.0 * np.pi + 0.1:
+    elif largest <= 2.0 * np.pi + 0.1:
         return None
-    wraps = np.abs(np.abs(np.diff(heading)) - FULL_TURN_DEG) < FULL_TURN_DEG / 10.0
-    spaced = _select_spaced(t)
-    turned = np.diff(np.unwrap(heading, period=FULL_TURN_DEG)[spaced])
-    rate = np.abs(turned) / np.diff(t[spaced])
-    is_fast = len(rate) > 0 and np.percentile(rate, 90) > FASTEST_TURN
-    if not (wraps.any() or is_fast or _is_only_along(pose[spaced], np.pi / 180.0)):
-        return None
-    reason = f"the heading is up to {np.abs(heading).max():.4g} rad"
+    else:
+        wraps = np.abs(np.abs(step) - FULL_TURN_DEG) < FULL_TURN_DEG / 10.0
+        spaced = _select_spaced(t)
+        turned = np.diff(np.unwrap(heading, period=FULL_TURN_DEG)[spaced])
+        rate = np.abs(turned) / np.diff(t[spaced])
+        is_fast = len(rate) > 0 and np.percentile(rate, 90) > FASTEST_TURN
+        if not (wraps.any() or is_fast or _is_only_along(pose[spaced], np.pi / 180.0)):
+            return None
+    cause = "it must be in radians (degrees look like this)"
     return Implausible(reason, cause, "heading_unit: deg")
-
-
-def _find_wrong_degrees(pose: Array) -> Implausible | None:
-    if not _is_only_along(pose, 180.0 / np.pi):
-        return None
-    cause = "it was in radians, but is read as degrees"
-    return Implausible(
-        (
-            f"the heading is up to {np.abs(pose[:, 2]).max():.2g} rad, and the path "
-            "follows 57 times that angle"
-        ),
-        cause,
-        "heading_unit: rad",
-    )
 
 
 def _is_only_along(pose: Array, scale: float) -> bool:
@@ -500,10 +481,8 @@ def find_clockwise_keys(pose: Array) -> HeadingKeys:
     None are needed unless the path is aligned with the mirrored headings by at least
     `MIN_MIRRORED`, and by `BETTER` more than with the recorded ones.
     """
-    if not has_visible_axes(pose):
-        return HeadingKeys.NONE
-    mirrored = _compute_course(pose, -1.0)
-    if abs(mirrored) < max(MIN_MIRRORED, BETTER + _measure_alignment(pose, 1.0)):
+    least = max(MIN_MIRRORED, BETTER + _measure_alignment(pose, 1.0))
+    if not has_visible_axes(pose) or _measure_alignment(pose, -1.0) < least:
         return HeadingKeys.NONE
     return choose_clockwise_keys(pose)
 
@@ -538,60 +517,42 @@ def _select_spaced(t: Array) -> NDArray[np.intp]:
 def _find_too_fast(
     t: Array, pose: Array, fastest: float, hardest: float
 ) -> Implausible | None:
-    spaced = _select_spaced(t)
-    span = np.maximum(np.diff(t[spaced]), 1e-9)
+    """Finds spaced poses (T, 3) that move too fast, or change their speed too fast."""
+    span = np.maximum(np.diff(t), 1e-9)
     if not len(span):
         return None
-    velocity = np.diff(pose[spaced, :2], axis=0) / span[:, None]
+    velocity = np.diff(pose[:, :2], axis=0) / span[:, None]
     speed = np.percentile(np.hypot(*velocity.T), 90)
-    cause = "positions must be in metres and stamps in seconds"
-    line = "unit: cm"
-    if speed > SLOWEST_IN_CM:
-        line = "unit: mm"
+    reason = f"moves at {speed:.3g} m/s"
     if speed > TOO_FAST * fastest:
-        reason = (
-            f"moves at {speed:.3g} m/s, but its commands are at most {fastest:g} m/s"
-        )
-        return Implausible(reason, cause, line)
-    if np.isfinite(fastest) or len(span) < 3:
+        reason += f", but its commands are at most {fastest:g} m/s"
+    elif np.isfinite(fastest) or len(span) < 3:
         return None
-    acceleration = np.hypot(*np.diff(velocity, axis=0).T) / span[1:]
-    usual_acceleration = np.percentile(acceleration, 75)
-    if usual_acceleration <= hardest:
-        return None
-    reason = (
-        f"moves at {speed:.3g} m/s and changes that by {usual_acceleration:.3g} m/s^2"
-    )
-    return Implausible(reason, cause, line)
+    else:
+        change = np.hypot(*np.diff(velocity, axis=0).T) / span[1:]
+        acceleration = np.percentile(change, 75)
+        if acceleration <= hardest:
+            return None
+        reason += f" and changes that by {acceleration:.3g} m/s^2"
+    cause = "positions must be in metres and stamps in seconds"
+    unit = "mm" if speed > SLOWEST_IN_CM else "cm"
+    return Implausible(reason, cause, f"unit: {unit}")
 
 
 def compute_usual_step(t: Array) -> float:
     """Returns the median of the steps forward between stamps (T,), 0 if there are none."""
     step = np.diff(t)
     forward = step[step > 0.0]
-    if not len(forward):
-        return 0.0
-    return float(np.median(forward))
+    return float(np.median(forward)) if len(forward) else 0.0
 
 
 def guess_time_unit(t: Array) -> str | None:
     """Returns the unit of stamps (T,) that can't be seconds; None if they can."""
     step = compute_usual_step(t)
-    if step <= SLOWEST_SAMPLING_S:
-        return None
-    for unit in UNITS_OF_STEP:
-        if step * UNITS[unit].factor < SLOWEST_SAMPLING_S:
-            return unit
+    for unit in ("s", *UNITS_OF_STEP):
+        if step * UNITS[unit].factor <= SLOWEST_SAMPLING_S:
+            return None if unit == "s" else unit
     return None
-
-
-def _find_too_slow(t: Array) -> Implausible | None:
-    unit = guess_time_unit(t)
-    if unit is None:
-        return None
-    reason = f"there are {np.median(np.diff(t)):.3g} s between samples"
-    cause = f"stamps must be in seconds ({UNITS_OF_STEP[unit]} look like this)"
-    return Implausible(reason, cause, f"time: {{from: ..., unit: {unit}}}")
 
 
 def is_w_first(quaternions: ArrayLike) -> bool:

@@ -8,22 +8,15 @@ from typing import Any
 import numpy as np
 
 from nics_drl_bridge.errors import RecordingError, suggest
-from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.bag_file import Message, read_times
 from nics_drl_bridge.recording.bag_table import Bag, make_message_table
 from nics_drl_bridge.recording.imu_axis import AXES, find_table_axis
-from nics_drl_bridge.recording.mapping import (
-    ARRIVAL,
-    HEADER,
-    UNITS,
-    DriveMapping,
-    Value,
-)
+from nics_drl_bridge.recording.mapping import ARRIVAL, HEADER, UNITS, DriveMapping
 from nics_drl_bridge.recording.messages import POSITION_UNITS, WHEELS
 from nics_drl_bridge.recording.stamping import TopicData
 from nics_drl_bridge.recording.table import Table, read_numbers
 from nics_drl_bridge.recording.topic_roles import JointSource, TopicRoles, assign
-from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
+from nics_drl_bridge.robot.spec import RobotSpec
 
 TIMES = {"auto": None, "header": HEADER, "receive": ARRIVAL}
 JOINT_FIELD = re.compile(r"(position|velocity)\[(.+)\]")
@@ -111,8 +104,16 @@ def _map_state(
     values = {}
     for variable in spec.state:
         source = roles.state.get(variable.name) or _match_joint(joints, variable.name)
+        if isinstance(source, str):
+            source = JointSource(joint=source)
         if source is not None:
-            values[variable.name] = _map_joint(table, variable, source)
+            _check_joint(table, source.joint)
+            usual = "position" if variable.unit in POSITION_UNITS else "velocity"
+            values[variable.name] = {
+                "from": f"{source.field or usual}[{source.joint}]",
+                "scale": source.scale,
+                "unit": variable.unit if variable.unit in UNITS else None,
+            }
         elif is_needed:
             others = ", ".join(joints) or "none"
             raise RecordingError(
@@ -120,23 +121,7 @@ def _map_state(
                 f"its joints are {others}: name it in the topics file, as in state: "
                 f"{{{variable.name}: JOINT}}."
             )
-    if len(values) < len(names):
-        return {}
-    return values
-
-
-def _map_joint(
-    table: Table, variable: StateVariable, source: JointSource | str
-) -> dict[str, Any]:
-    if isinstance(source, str):
-        source = JointSource(joint=source)
-    _check_joint(table, source.joint)
-    usual = "position" if variable.unit in POSITION_UNITS else "velocity"
-    return {
-        "from": f"{source.field or usual}[{source.joint}]",
-        "scale": source.scale,
-        "unit": variable.unit if variable.unit in UNITS else None,
-    }
+    return values if len(values) == len(names) else {}
 
 
 def _map_wheels(table: Table, roles: TopicRoles) -> dict[str, dict[str, Any]]:
@@ -144,11 +129,13 @@ def _map_wheels(table: Table, roles: TopicRoles) -> dict[str, dict[str, Any]]:
     for name in chosen:
         _check_joint(table, name)
     if not chosen:
-        turning = [n for n in table.names if n.startswith("velocity[")]
-        turning = [n for n in turning if np.isfinite(read_numbers(table, n)).any()]
-        joints = [name[len("velocity[") : -1] for name in turning]
-        guesses = (_match_joint(joints, wheel) for wheel in WHEELS)
-        chosen = tuple(name for name in guesses if name is not None)
+        joints = [
+            name[len("velocity[") : -1]
+            for name in table.names
+            if name.startswith("velocity[")
+            and np.isfinite(read_numbers(table, name)).any()
+        ]
+        chosen = tuple(filter(None, (_match_joint(joints, wheel) for wheel in WHEELS)))
     if len(chosen) < len(WHEELS):
         return {}
     left, right = ({"from": f"velocity[{name}]"} for name in chosen)
@@ -177,9 +164,7 @@ def _match_joint(names: Iterable[str], wanted: str) -> str | None:
     ]
     if wanted in fitting:
         return wanted
-    if len(fitting) == 1:
-        return fitting[0]
-    return None
+    return fitting[0] if len(fitting) == 1 else None
 
 
 def read_joint_streams(
@@ -190,14 +175,22 @@ def read_joint_streams(
     place: str,
 ) -> dict[str, TopicData]:
     """Reads `state` and `wheels` from messages in memory. Raises RecordingError if one fails."""
-    plain = [Message(m.receive_ns, _copy_joints(m.content)) for m in messages]
+    plain = []
+    for message in messages:
+        joints = message.content  # of rclpy or rosbags
+        copy = SimpleNamespace(
+            name=list(joints.name),
+            position=np.array(joints.position),
+            velocity=np.array(joints.velocity),
+        )
+        plain.append(Message(message.receive_ns, copy))
     table = make_message_table(f"{place}: topic {topic!r}", plain)
     streams = {}
     for name, values in map_joints(table, spec, roles).items():
-        columns: list[Array] = []
-        for value in values.values():
-            scale = Value.model_validate(value).scale
-            columns.append(scale * read_numbers(table, value["from"]))
+        columns = [
+            value.get("scale", 1.0) * read_numbers(table, value["from"])
+            for value in values.values()
+        ]
         rows = np.stack(columns, axis=1)
         is_whole = np.asarray(np.isfinite(rows).all(axis=1))
         if not is_whole.any():
@@ -207,12 +200,3 @@ def read_joint_streams(
             )
         streams[name] = TopicData(topic, *read_times(messages), rows).rows(is_whole)
     return streams
-
-
-def _copy_joints(message: Any) -> SimpleNamespace:
-    """Copies the joints of a message of rclpy or rosbags."""
-    position = np.array(message.position)
-    velocity = np.array(message.velocity)
-    return SimpleNamespace(
-        name=list(message.name), position=position, velocity=velocity
-    )

@@ -1,7 +1,5 @@
 """Stamps: clocks of topics, by headers or receipt, and repairs of stamps and counters."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
@@ -81,7 +79,7 @@ class TopicData:
     header_ns: Nanoseconds | None
     values: Array  # (T, D)
 
-    def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> TopicData:
+    def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> "TopicData":
         """Returns the messages selected by `keep`, a mask (T,) or indices."""
         header_ns = self.header_ns
         if header_ns is not None:
@@ -102,28 +100,31 @@ def stamp_streams(
     # recorder's clock. Others are on a foreign clock; shifted by the median delay, they leave a
     # small offset for calibration. Command, state, wheels and IMU share one clock, by receipt if
     # necessary. Late messages are sorted; messages before a simulation's first time are dropped.
+    headers: dict[str, Nanoseconds | None] = dict.fromkeys(data)
     if stamps != "receive":
         data = {name: _sort_by_stamp(part, place) for name, part in data.items()}
+        for name, part in data.items():
+            headers[name] = _check_header(part, stamps, place)
     origin = min(int(part.receive_ns.min()) for part in data.values())
-    if stamps == "receive":
-        return {name: _stamp_by_receipt(part, origin) for name, part in data.items()}
-    headers = {name: _check_header(part, stamps, place) for name, part in data.items()}
+    clocks = dict.fromkeys(data, (RECEIVE, 0))
     if stamps == "header":
         first = min(int(ns.min()) for ns in headers.values() if ns is not None)
         clocks = dict.fromkeys(data, (HEADER, origin - first))
-    else:
+    elif stamps == "auto":
         clocks = _assign_clocks(data, headers, place)
     if len({clocks[name][0] for name in of_robot if name in data}) > 1:
         headers |= dict.fromkeys(of_robot)
     streams = {}
     for name, part in data.items():
+        clock, shift = clocks[name]
         ns = headers[name]
         if ns is None:
-            streams[name] = _stamp_by_receipt(part, origin)
-        else:
-            clock, shift = clocks[name]
-            t = np.asarray((ns + shift - origin) * S_PER_NS, dtype=np.float64)
-            streams[name] = Stream(t, part.values, clock)
+            part = part.rows(np.argsort(part.receive_ns, kind="stable"))
+            clock = RECEIVE
+            shift = 0
+            ns = part.receive_ns
+        t = np.asarray((ns + shift - origin) * S_PER_NS, dtype=np.float64)
+        streams[name] = Stream(t, part.values, clock)
     return streams
 
 
@@ -173,9 +174,7 @@ def _assign_clocks(
         median = _measure_delay(data[name].receive_ns - ns, place, topic)
         if SAME_CLOCK_S[0] <= median * S_PER_NS <= SAME_CLOCK_S[1]:
             continue
-        clock = HEADER
-        if foreign:
-            clock = f"{HEADER} of {topic}"
+        clock = f"{HEADER} of {topic}" if foreign else HEADER
         for other, shift in foreign.items():
             if abs(shift - median) * S_PER_NS < SAME_CLOCK_S[1]:
                 clock = other
@@ -203,7 +202,7 @@ def _make_error(place: str, topic: str, fault: str, advice: str) -> RecordingErr
     return RecordingError(f"{place}: {reason}; {advice}.", reason)
 
 
-def _sort_by_stamp(part: TopicData, place: str) -> TopicData:
+def _sort_by_stamp(part: TopicData, place: str) -> "TopicData":
     """Drops unstamped messages at the start, and sorts the few late ones by stamp."""
     ns = part.header_ns
     if ns is None or not ns.any():
@@ -221,12 +220,6 @@ def _sort_by_stamp(part: TopicData, place: str) -> TopicData:
         advice = f"{USE_RECEIPT}, or cut the bag there"
         raise _make_error(place, part.topic, fault, advice)
     return part.rows(np.argsort(ns, kind="stable"))
-
-
-def _stamp_by_receipt(part: TopicData, origin: int) -> Stream:
-    order = np.argsort(part.receive_ns, kind="stable")
-    t = np.asarray((part.receive_ns[order] - origin) * S_PER_NS, dtype=np.float64)
-    return Stream(t, part.values[order], RECEIVE)
 
 
 def join_stamps(seconds: NDArray[Any], nanoseconds: NDArray[Any]) -> Array:
@@ -247,16 +240,10 @@ def find_overflow(
         return None
     usual = float(np.percentile(np.abs(step), 95))
     span = float(np.ptp(values))
-    sizes: list[float] = []
-    for unit in scale:
-        sizes += [2.0**bit * unit for bit in bits]
-    for size in sorted(sizes):
+    for size in sorted(2.0**bit * unit for unit in scale for bit in bits):
         jump = np.abs(step) > size / 2.0
-        if (
-            max(span, np.abs(values).max()) > size
-            or not jump.any()
-            or jump.mean() > 0.5
-        ):
+        is_too_large = max(span, np.abs(values).max()) > size
+        if is_too_large or not 0.0 < jump.mean() <= 0.5:
             continue
         rest = np.abs(step[jump] - np.sign(step[jump]) * size)
         if rest.max() <= USUAL * max(usual, size * 1e-9):
@@ -312,10 +299,8 @@ def count_rows_a_second(t: Array) -> int:
 
 def remove_overflow(t: Array, name: str) -> tuple[Array, str]:
     """Continues stamps (T,) of a clock of 32 bits or less across its overflows; returns a note."""
-    size = None
-    if (np.diff(t) < 0.0).any():
-        size = find_overflow(t, (1.0, 1e-3, 1e-6, 1e-9), STAMP_BITS)
-    if size is None:
+    size = find_overflow(t, (1.0, 1e-3, 1e-6, 1e-9), STAMP_BITS)
+    if size is None or not (np.diff(t) < 0.0).any():
         return t, ""
     continued, count = unwrap_counter(t, size)
     return continued, (
@@ -390,9 +375,7 @@ def _find_stray(t: Array) -> NDArray[np.bool_]:
 
 def format_times(count: int) -> str:
     """Returns `once`, or how many times."""
-    if count == 1:
-        return "once"
-    return f"{count} times"
+    return "once" if count == 1 else f"{count} times"
 
 
 def select_new_rows(

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,13 @@ import numpy as np
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording import stamping
-from nics_drl_bridge.recording.mapping import UNITS, is_place_on_earth
-from nics_drl_bridge.recording.names import split_words, word_set, write_reference
+from nics_drl_bridge.recording.mapping import (
+    UNITS,
+    is_place_on_earth,
+    split_words,
+    word_set,
+    write_reference,
+)
 from nics_drl_bridge.recording.recording import (
     IRREGULAR,
     UNITS_OF_STEP,
@@ -101,17 +107,28 @@ def split_unit(name: str) -> tuple[list[str], str | None]:
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """A column of a table: its name, and the range of its numbers."""
+    """A column of a table."""
 
     table: "TableSurvey" = field(repr=False)
     name: str  # as a mapping refers to it within its table
-    low: float  # NaN for text
-    high: float
+    values: Column  # (T,)
 
-    @property
-    def is_number(self) -> bool:
-        """True if it holds numbers."""
-        return bool(np.isfinite(self.low))
+    @cached_property
+    def numbers(self) -> Array:
+        """Values (T,) as numbers; NaN for text."""
+        if is_text(self.values):
+            return np.full(len(self.values), np.nan)
+        return self.values.astype(np.float64)
+
+    @cached_property
+    def low(self) -> float:
+        """Minimum of its numbers; NaN if there are none."""
+        return float(np.fmin.reduce(self.numbers, initial=np.nan))
+
+    @cached_property
+    def high(self) -> float:
+        """Maximum of its numbers; NaN if there are none."""
+        return float(np.fmax.reduce(self.numbers, initial=np.nan))
 
     @property
     def moves(self) -> bool:
@@ -124,12 +141,15 @@ class Field:
         return is_place_on_earth(self.name, self.low, self.high)
 
     @property
+    def name_words(self) -> set[str]:
+        """Words of its name."""
+        return {*split_words(self.name)}
+
+    @property
     def words(self) -> list[str]:
         """Words of its name without the unit; for `data`, those of the table's name."""
         words = split_unit(self.name)[0]
-        if words == ["data"]:
-            return split_words(self.table.name)
-        return words
+        return split_words(self.table.name) if words == ["data"] else words
 
     @property
     def unit(self) -> str | None:
@@ -139,17 +159,7 @@ class Field:
     @property
     def counts(self) -> bool:
         """True if its name is that of ticks."""
-        return not TICKS.isdisjoint(split_words(self.name))
-
-    @property
-    def values(self) -> Column:
-        """Values (T,)."""
-        return self.table.data[self.name]
-
-    @property
-    def numbers(self) -> Array:
-        """Values (T,) as numbers."""
-        return np.asarray(self.values, dtype=np.float64)
+        return not TICKS.isdisjoint(self.name_words)
 
     @property
     def reference(self) -> str:
@@ -163,17 +173,30 @@ class TableSurvey:
     """A table: how its rows are stamped, and its columns."""
 
     name: str
-    rows: int
+    kind: str = ""  # message type, of a topic
+    findings: list[str] = field(default_factory=list)
     columns: list[Field] = field(default_factory=list)
     # columns of the stamps (one, or seconds and nanoseconds); empty if stamps come with
     # the rows
     stamp_columns: Sequence[str] = ()
     unit: str | None = None  # unit of the stamps, unless seconds
-    findings: list[str] = field(default_factory=list)
     t: Array | None = None  # (T,) [s]
-    data: dict[str, Column] = field(default_factory=dict)
-    kind: str = ""  # message type, of a topic
     is_single: bool = True  # False if there are other tables
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return max((len(column.values) for column in self.columns), default=0)
+
+    @property
+    def words(self) -> set[str]:
+        """Words of its name."""
+        return {*split_words(self.name)}
+
+    @property
+    def by_name(self) -> dict[str, Field]:
+        """Its columns by name."""
+        return {column.name: column for column in self.columns}
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -204,14 +227,15 @@ class TableSurvey:
     @property
     def numbers(self) -> list[Field]:
         """The columns that hold numbers."""
-        return [column for column in self.columns if column.is_number]
+        return [column for column in self.columns if np.isfinite(column.low)]
 
     @property
     def regularity(self) -> list[str]:
         """Returns sentences on rate, gaps, backward stamps, repeated rows and missing values."""
         if self.t is None or len(self.t) < 2:
             return []
-        return list(_describe_regularity(self.t, _select_numbers(self.data)))
+        columns = [column for column in self.columns if not is_text(column.values)]
+        return list(_describe_regularity(self.t, columns))
 
 
 def inspect_tables(source: Source) -> list[TableSurvey]:
@@ -222,7 +246,7 @@ def inspect_tables(source: Source) -> list[TableSurvey]:
         try:
             tables.append(_inspect_table(name, source.get_table(name)))
         except RecordingError as error:  # one unreadable table leaves the others
-            tables.append(TableSurvey(name, 0, findings=[str(error)]))
+            tables.append(TableSurvey(name, findings=[str(error)]))
             first_error = first_error or error
     if first_error is not None and not any(table.columns for table in tables):
         raise first_error
@@ -251,20 +275,17 @@ def _correct_units(tables: Sequence[TableSurvey]) -> None:
 
 
 def _inspect_table(name: str, table: Table) -> TableSurvey:
-    survey = TableSurvey(name, 0, findings=list(table.notes), kind=table.kind)
+    survey = TableSurvey(name, table.kind, list(table.notes))
     for k, title in enumerate(table.names[:MOST_COLUMNS]):
-        column_name = title
+        column = title
         if not title or table.names.count(title) > 1:
-            column_name = str(k)
-        column = table.column(column_name)
-        survey.data[column_name] = column
-        survey.columns.append(Field(survey, column_name, *_find_range(column)))
-    survey.rows = max((len(column) for column in survey.data.values()), default=0)
+            column = str(k)
+        survey.columns.append(Field(survey, column, table.column(column)))
     stream = table.stamps("")
     if stream is not None:
         survey.t = stream.t
         return survey
-    survey.stamp_columns, raw = _guess_stamps(survey.data)
+    survey.stamp_columns, raw = _guess_stamps(survey.columns)
     if survey.stamp_columns:
         raw = raw[np.isfinite(raw)]
         survey.unit = guess_time_unit(raw)
@@ -284,39 +305,23 @@ def _guess_unit_by_name(name: str, raw: Array) -> str | None:
     return None if is_too_short else unit
 
 
-def _find_range(column: Column) -> tuple[float, float]:
-    if is_text(column):
-        return np.nan, np.nan
-    values = column.astype(np.float64)
-    if not np.isfinite(values).any():
-        return np.nan, np.nan
-    return float(np.nanmin(values)), float(np.nanmax(values))
-
-
-def _select_numbers(data: dict[str, Column]) -> dict[str, Array]:
-    return {
-        name: column.astype(np.float64)
-        for name, column in data.items()
-        if not is_text(column)
-    }
-
-
-def _guess_stamps(data: dict[str, Column]) -> tuple[Sequence[str], Array]:
+def _guess_stamps(columns: Sequence[Field]) -> tuple[Sequence[str], Array]:
     """Guesses the columns of stamps by their names and by how steadily they rise."""
-    values = _select_numbers(data)
-    for seconds, fraction in stamping.SPLIT:
-        if {seconds, fraction} <= values.keys():
-            stamps = stamping.join_stamps(data[seconds], data[fraction])
-            return (seconds, fraction), stamps
-    for name, column in data.items():
-        dates = None if name in values else parse_dates(column)
-        if dates is not None:
-            values[name] = dates
-    scores = {name: _score_stamps(name, column) for name, column in values.items()}
+    stamps: dict[str, Array] = {}
+    for column in columns:
+        times: Array | None = column.numbers
+        if is_text(column.values):
+            times = parse_dates(column.values)
+        if times is not None:
+            stamps[column.name] = times
+    for split in stamping.SPLIT:
+        if {*split} <= stamps.keys():
+            return split, stamping.join_stamps(*(stamps[name] for name in split))
+    scores = {name: _score_stamps(name, times) for name, times in stamps.items()}
     best = max(scores, key=lambda name: scores[name], default="")
     if scores.get(best, 0.0) < LEAST_SCORE:
         return (), np.zeros(0)
-    return (best,), values[best]
+    return (best,), stamps[best]
 
 
 def _score_stamps(name: str, values: Array) -> float:
@@ -333,7 +338,7 @@ def _score_stamps(name: str, values: Array) -> float:
     return (has_name_of_time + 0.5 * is_nameless) * float(np.mean(step > 0.0))
 
 
-def _describe_regularity(t: Array, numbers: dict[str, Array]) -> Iterator[str]:
+def _describe_regularity(t: Array, columns: Sequence[Field]) -> Iterator[str]:
     """Yields sentences on rate, gaps, backward stamps, repeated rows and missing values."""
     step = np.diff(t)
     usual = compute_usual_step(t) or np.nan
@@ -347,7 +352,7 @@ def _describe_regularity(t: Array, numbers: dict[str, Array]) -> Iterator[str]:
         yield f"stamps that run backwards: {backward}"
     repeated = int((step == 0.0).sum())
     if repeated:
-        whole = [c for c in numbers.values() if len(c) == len(t)]
+        whole = [c.numbers for c in columns if len(c.values) == len(t)]
         is_same = np.all([c[1:] == c[:-1] for c in whole], axis=0) & (step == 0.0)
         yield (
             f"stamps like the one before: {repeated}, in rows that repeat all of it: "
@@ -356,7 +361,7 @@ def _describe_regularity(t: Array, numbers: dict[str, Array]) -> Iterator[str]:
     if (np.abs(step - usual) > IRREGULAR * usual).mean() > IRREGULAR:
         yield "stamps are uneven: rows arrive in bursts"
     missing: dict[int, list[str]] = {}
-    for name, c in numbers.items():
-        missing.setdefault(int(np.isnan(c).sum()), []).append(name)
+    for column in columns:
+        missing.setdefault(int(np.isnan(column.numbers).sum()), []).append(column.name)
     for count in sorted(missing.keys() - {0}):
         yield f"{count} of {len(t)} rows have no {', '.join(missing[count])}"

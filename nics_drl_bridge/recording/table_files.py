@@ -2,21 +2,19 @@
 
 import csv
 import re
-import zipfile
 from collections import Counter
 from collections.abc import Callable, Sequence
-from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.config import check_no_device
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.files import count_unpacked
 from nics_drl_bridge.recording.table import (
     Column,
     Source,
@@ -51,37 +49,26 @@ def read_text_table(path: Path) -> Table:
     """Reads a table. Raises RecordingError with the file, the line and the fix."""
     numbers, lines, comments = _read_lines(path)
     separator = _find_separator(lines[:TRIED])
-    rows = list(map(partial(_split, separator=separator), lines))
+    rows = [_split(line, separator) for line in lines]
     first, width = _find_first_row(path, rows)
     above = rows[:first]
     rows, numbers, notes = _keep_one_width(
         path, rows[first:], numbers[first:], above, width
     )
-    head = _choose_head(above, width)
+    # The last title with the most distinct names: a row of units below it repeats some.
+    titles = [row for row in reversed(above) if len(row) > 1 or width == 1]
+    head = max(titles, key=lambda row: len(set(row)), default=None)
     if head is None and comments:
         head = _find_title(comments[-1], separator, width)
-    may_be_tum = separator is None or path.suffix == TUM_SUFFIX
-    columns = _make_columns(rows, head, may_be_tum)
-    return make_table(str(path), *columns, numbers, tuple(notes))
-
-
-def _choose_head(above: Sequence[list[str]], width: int) -> list[str] | None:
-    """Returns the last title with the most distinct names: a row of units below it repeats some."""
-    titles = [row for row in above if len(row) > 1 or width == 1]
-    return max(reversed(titles), key=lambda row: len(set(row)), default=None)
-
-
-def _make_columns(
-    rows: list[list[str]], head: list[str] | None, may_be_tum: bool
-) -> tuple[tuple[str, ...], list[Column]]:
-    """Returns names and values of the columns; without a head, the content may show the names."""
     columns = [list(column) for column in zip(*rows, strict=True)]
+    may_be_tum = separator is None or path.suffix == TUM_SUFFIX
     if head is None and may_be_tum and _is_tum(columns):
         head = list(TUM)
     if head is None:
         columns, head = _split_labels(columns)
     names = tuple([*head, *[""] * len(columns)][: len(columns)])
-    return names, [_convert_column(_replace_commas(column)) for column in columns]
+    values = [_convert_column(column) for column in columns]
+    return make_table(str(path), names, values, numbers, tuple(notes))
 
 
 def _read_lines(path: Path) -> tuple[NDArray[np.intp], list[str], list[str]]:
@@ -243,9 +230,7 @@ def _is_tum(columns: Sequence[Sequence[str]]) -> bool:
     )
 
 
-def _split_labels(
-    columns: list[list[str]],
-) -> tuple[list[list[str]], list[str]]:
+def _split_labels(columns: list[list[str]]) -> tuple[list[list[str]], list[str]]:
     """Names columns by labels that are in each row, as in `time: 1.2 ticks: 3 4`, if any."""
     labelled: dict[str, list[list[str]]] = {}
     label = None
@@ -267,18 +252,15 @@ def _split_labels(
     return list(chain.from_iterable(labelled.values())), names
 
 
-def _replace_commas(column: list[str]) -> list[str]:
-    """Replaces decimal commas by points if that leaves only values."""
-    if not any("," in field for field in column):
-        return column
-    with_points = [field.replace(",", ".") for field in column]
-    if all(map(_is_value, with_points)):
-        return with_points
-    return column
+def _convert_column(column: list[str]) -> Column:
+    """Returns numbers if all fields are numbers, flags or missing values, else text.
 
-
-def _convert_column(column: Sequence[str]) -> Column:
-    """Returns numbers if all fields are numbers, flags or missing values, else text."""
+    Decimal commas count as points if that leaves only values.
+    """
+    if any("," in field for field in column):
+        with_points = [field.replace(",", ".") for field in column]
+        if all(map(_is_value, with_points)):
+            column = with_points
     for words in ({}, WORDS):
         try:
             return np.array([words.get(f.lower(), f) for f in column], dtype=np.float64)
@@ -291,7 +273,7 @@ def read_arrays(path: Path) -> Table:
     """Reads an .npz or .npy file, also of records. Raises RecordingError for objects or damage."""
     try:
         with check_no_device(path).open("rb") as file:
-            if _count_unpacked(file) > MAX_UNPACKED_BYTES:
+            if count_unpacked(file) > MAX_UNPACKED_BYTES:
                 raise RecordingError(
                     f"{path}: unpacked it is larger than {MAX_UNPACKED_BYTES // 2**20} "
                     "MB; split it."
@@ -314,16 +296,6 @@ def read_arrays(path: Path) -> Table:
     return make_table(
         str(path), tuple(name for name, _ in columns), tuple(c for _, c in columns)
     )
-
-
-def _count_unpacked(file: BinaryIO) -> int:
-    """Returns the size of an archive's members when unpacked [bytes]; 0 for other files."""
-    size = 0
-    if zipfile.is_zipfile(file):
-        with zipfile.ZipFile(file) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-    file.seek(0)
-    return size
 
 
 def read_parquet(path: Path) -> Table:

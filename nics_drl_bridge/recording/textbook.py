@@ -4,6 +4,7 @@ import numpy as np
 
 from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.recording.heading import chain_poses
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.kinds import Textbook, textbook
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -34,14 +35,6 @@ def _integrate_substep(
     )
 
 
-def _chain_poses(relative: Array) -> Array:
-    """Returns the poses (T, 3) from which relative poses (T, 3) lead on, from the origin on."""
-    heading = np.concatenate([[0.0], np.cumsum(relative[:-1, 2])])
-    moved = geometry.rotate(relative[:, :2], heading)
-    position = np.concatenate([np.zeros((1, 2)), np.cumsum(moved[:-1], axis=0)])
-    return np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
-
-
 def record(
     spec: RobotSpec,
     rng: np.random.Generator,
@@ -65,7 +58,7 @@ def record(
         arcs.append(_integrate_substep(book, now, goal, since, h))
         now = book.respond(now, goal, per_hold * inner * h)
     state = np.concatenate(states)[::inner]
-    pose = _chain_poses(geometry.exp(np.concatenate(arcs)))[::inner]
+    pose = chain_poses(np.zeros(3), geometry.exp(np.concatenate(arcs)))[:-1:inner]
     t = np.asarray(np.arange(holds * per_hold) * dt, dtype=np.float64)
     return Recording(
         Stream(t, np.repeat(held, per_hold, axis=0)),

@@ -154,11 +154,11 @@ def assign(
 ) -> dict[str, str]:
     """Assigns topics, named or guessed, to roles. Raises RecordingError if that is unclear."""
     table = _Topics(types, empty, place)
-    assigned = {}
+    assigned: dict[str, str] = {}
     for role in ROLES:
-        if role == "odom" and "pose" in assigned and roles.odom is None:
-            continue
-        topic = table.choose(role, getattr(roles, role))
+        topic = None
+        if role != "odom" or "pose" not in assigned or roles.odom is not None:
+            topic = table.choose(role, getattr(roles, role))
         if topic is not None:
             assigned[role] = topic
     for needed, words in ((("cmd_vel",), "commands"), (("pose", "odom"), "poses")):
@@ -180,12 +180,8 @@ class _Topics:
         if wanted is None:
             return self._guess(role)
         topic = f"/{wanted.removeprefix('/')}"
-        fault = None
-        if topic in self.empty:
-            fault = "holds no messages of the"
-        elif topic not in self.types:
-            fault = "has no"
-        if fault is not None:
+        if topic in self.empty or topic not in self.types:
+            fault = "holds no messages of the" if topic in self.empty else "has no"
             topics = self._list_topics((role,))
             raise RecordingError(
                 f"{self.place}: {fault} topic {topic!r} ({role}); {topics}"
@@ -202,25 +198,22 @@ class _Topics:
         fitting = self._find_fitting(role)
         for pattern in USUAL[role]:
             # A simulator publishes the true pose as odometry; other odometry is not guessed.
-            never: tuple[str, ...] = (TRANSFORMS,)
-            if pattern != GROUND_TRUTH:
-                never = NEVER_GUESSED.get(role, ())
+            is_truth = pattern == GROUND_TRUTH
+            never = (TRANSFORMS,) if is_truth else NEVER_GUESSED.get(role, ())
             topics = [
                 topic
                 for topic in fitting
                 if self.types[topic] not in never and re.search(pattern, topic)
             ]
-            if len(topics) == 1:
-                return topics[0]
-            if topics:
-                several = ", ".join(
-                    f"{topic} ({self.types[topic]})" for topic in topics
-                )
+            if len(topics) > 1:
+                several = ", ".join(f"{name} ({self.types[name]})" for name in topics)
                 fault = f"each of several topics could be {role}: {several}"
                 advice = f"choose one with --topic {role}={topics[0]}"
                 if role != "cmd_vel":
                     advice += f", or {role}={NONE} for none"
                 raise RecordingError(f"{self.place}: {fault}; {advice}.")
+            if topics:
+                return topics[0]
         return None
 
     def describe_missing(self, roles: Sequence[str], words: str) -> str:
@@ -247,11 +240,10 @@ class _Topics:
     def _list_topics(self, roles: Sequence[str]) -> str:
         fitting = self._find_fitting(*roles)
         topics = sorted(self.types, key=lambda topic: (topic not in fitting, topic))
-        listed = []
-        for topic in topics[:MOST_LISTED]:
-            empty = ", empty" * (topic in self.empty)
-            listed.append(f"{topic} ({self.types[topic]}{empty})")
-        text = ", ".join(listed)
+        text = ", ".join(
+            f"{topic} ({self.types[topic]}{', empty' * (topic in self.empty)})"
+            for topic in topics[:MOST_LISTED]
+        )
         if len(topics) > MOST_LISTED:
             text += f" and {len(topics) - MOST_LISTED} more"
         return f"its topics are {text}."

@@ -21,13 +21,7 @@ from nics_drl_bridge.recording.mapping import (
     Value,
 )
 from nics_drl_bridge.recording.recording import Stream, guess_time_unit
-from nics_drl_bridge.recording.table import (
-    Column,
-    Source,
-    Table,
-    is_text,
-    read_numbers,
-)
+from nics_drl_bridge.recording.table import Column, Source, Table, is_text, read_numbers
 
 ZONE = re.compile(r"(?:Z|([+-])(\d\d):?(\d\d))$")  # offset of a date from UTC
 CLOCK = re.compile(r"\d\d:\d\d:\d\d")  # a time of day
@@ -328,7 +322,10 @@ def get_unit(value: Value) -> UnitOfData:
         unit = "ticks"
     if unit is None:
         return UnitOfData("", 1.0)
-    si, factor = schema.to_si(unit, value.ticks_per_turn)
+    si, factor = schema.UNITS[unit]
+    if si in schema.TICKS and value.ticks_per_turn:
+        si = schema.TICKS[si]
+        factor = schema.TURN / value.ticks_per_turn
     if value.counts:
         si = schema.RATES.get(si, si)
     return UnitOfData(si, factor)

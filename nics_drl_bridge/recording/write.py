@@ -93,20 +93,12 @@ def write_bag(
                 late_ns = shift_ns + APART_NS
             for receive_ns, values in zip(receive.tolist(), stream.values, strict=True):
                 content = write_content(values)
-                content["header"] = _make_header(receive_ns - late_ns)
-                sink.write(topic, receive_ns, _serialize(sink.store, kind, content))
-
-
-def _serialize(store: "Typestore", kind: str, content: Content) -> bytes:
-    return bytes(store.serialize_cdr(_make_message(store, kind, content), kind))
-
-
-def _make_header(stamp_ns: int) -> dict[str, Any]:
-    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
-    return {
-        "stamp": {"sec": seconds, "nanosec": nanoseconds},
-        "frame_id": FRAMES[0],
-    }
+                seconds, nanoseconds = divmod(receive_ns - late_ns, NS_PER_S)
+                stamp = {"sec": seconds, "nanosec": nanoseconds}
+                content["header"] = {"stamp": stamp, "frame_id": FRAMES[0]}
+                message = _make_message(sink.store, kind, content)
+                data = bytes(sink.store.serialize_cdr(message, kind))
+                sink.write(topic, receive_ns, data)
 
 
 def _list_topics(
@@ -343,22 +335,18 @@ def _explain_failure(
     path: Path, error: BaseException, unfinished: Path | None
 ) -> RecordingError:
     """Returns the error of a bag that could not be written, and what is `unfinished` of it."""
+    reason = str(error) or type(error).__name__
+    if isinstance(error, RecordingError):
+        reason = error.reason or "could not be finished"
+    elif isinstance(error, OSError) and error.strerror:
+        reason = error.strerror  # without the path
     rest = "nothing was written yet, choose another place"
     if unfinished is not None:
         rest = (
             f"what was written until then lies in {unfinished}, recover it with `mcap recover` or "
             "`ros2 bag reindex` where there is room"
         )
-    return RecordingError(f"{path}: {_get_reason(error)}; {rest}.")
-
-
-def _get_reason(error: BaseException) -> str:
-    """Returns what is wrong, without the path, which the caller's sentence names."""
-    if isinstance(error, RecordingError):
-        return error.reason or "could not be finished"
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return str(error) or type(error).__name__
+    return RecordingError(f"{path}: {reason}; {rest}.")
 
 
 def _set_apart(unfinished: Path, path: Path) -> Path:

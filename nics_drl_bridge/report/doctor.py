@@ -222,10 +222,13 @@ def check_latency(facts: Facts, _: Expected) -> Findings:
                 "look for a second publisher, or for a clock that is set while it runs"
             )
             yield error("stamp", role, what, fix)
-        age = (
-            float(np.median(_select_present(facts, heard.arrivals_ns) - stamps))
-            * S_PER_NS
-        )
+        times = np.array(heard.arrivals_ns, dtype=np.int64)
+        if facts.clock_ns:
+            # The clock tick of a message is sent with it, and may arrive after it.
+            ticks = facts.heard[CLOCK].arrivals_ns
+            place = np.searchsorted(ticks, times, side="right")
+            times = np.array(facts.clock_ns)[place.clip(0, len(ticks) - 1)]
+        age = float(np.median(times - stamps)) * S_PER_NS
         if -FUTURE_S <= age <= LATE_S:
             continue
         side = "after" if age < 0 else "before"
@@ -235,16 +238,6 @@ def check_latency(facts: Facts, _: Expected) -> Findings:
         yield error(
             "stamp", role, f"stamps lie {abs(age):.3f} s {side} their arrival", fix
         )
-
-
-def _select_present(facts: Facts, arrivals: Sequence[int]) -> NDArray[np.int64]:
-    times = np.array(arrivals, dtype=np.int64)
-    if not facts.clock_ns:
-        return times
-    ticks = np.array(facts.heard[CLOCK].arrivals_ns, dtype=np.int64)
-    # The clock tick of a message is sent with it, and may arrive after it.
-    place = np.searchsorted(ticks, times, side="right").clip(0, len(ticks) - 1)
-    return np.asarray(np.array(facts.clock_ns, dtype=np.int64)[place])
 
 
 def check_clock(facts: Facts, _: Expected) -> Findings:
@@ -270,8 +263,7 @@ def check_clock(facts: Facts, _: Expected) -> Findings:
 def check_motion(facts: Facts, expected: Expected) -> Findings:
     """Checks odometry and commands for NaN, wrong units and wrong signs."""
     yield from _check_odometry(facts, expected.robot)
-    ratio = _estimate_scale(facts)
-    if ratio is not None and ratio < 0.0:
+    if _turns_against_commands(facts):
         fix = "swap the wheels or invert the sign of angular.z: counter-clockwise is positive"
         yield error("command", CMD_VEL, "the robot turns against its commands", fix)
 
@@ -322,15 +314,14 @@ def _compare_turns(facts: Facts) -> Turning | None:
     stamps = facts.heard[ODOM].stamps_ns if ODOM in facts.heard else []
     if not facts.poses or len(stamps) != len(facts.poses):
         return None
-    odom_ns, rows = np.unique(stamps, return_index=True)
-    poses = np.array(facts.poses)[rows]
     gyro_stamps, yaw_rates = zip(*facts.yaw_rates, strict=True)
-    gyro_ns, rows = np.unique(gyro_stamps, return_index=True)
-    rates = np.array(yaw_rates)[rows]
-    odom_t = (odom_ns - stamps[0]) * S_PER_NS
-    gyro_t = (gyro_ns - stamps[0]) * S_PER_NS
-    if not (np.isfinite(poses).all() and np.isfinite(rates).all()):
+    series: list[Array] = []
+    for stamps_ns, values in ((stamps, facts.poses), (gyro_stamps, yaw_rates)):
+        ns, rows = np.unique(stamps_ns, return_index=True)
+        series += [(ns - stamps[0]) * S_PER_NS, np.array(values)[rows]]
+    if not all(np.isfinite(column).all() for column in series):
         return None
+    odom_t, poses, gyro_t, rates = series
     for window_s in (WINDOW_S, SHORT_WINDOW_S):
         turning = compare_turning(odom_t, poses, gyro_t, rates, window_s)
         if turning is not None and turning.compared:
@@ -362,9 +353,9 @@ def _check_odometry(facts: Facts, robot: RobotSpec) -> Findings:
         what = f"{facts.uncovered} of {len(poses)} messages have a covariance of zeros"
         fix = "fill in pose.covariance and twist.covariance: zeros mean unknown"
         yield odometry_warning(what, fix)
-    corners = np.array([robot.command_low, robot.command_high])
-    fastest = max(float(np.hypot(*robot.to_fields(row)[:2])) for row in corners)
-    yield from _check_moves(facts, poses, twists, max(fastest, 0.1))
+    ends = (robot.command_low, robot.command_high)
+    fastest = max(0.1, *(np.hypot(*robot.to_fields(end)[:2]) for end in ends))
+    yield from _check_moves(facts, poses, twists, fastest)
 
 
 def _check_moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Findings:
@@ -415,8 +406,9 @@ def _compare_rates(
     units: Sequence[tuple[float, str]],
     good: str,
 ) -> Findings:
-    ratio = _fit_slope(real, claimed)
-    size = float(np.sqrt((real @ real) * (claimed @ claimed)))
+    power = float(real @ real)
+    ratio = float(real @ claimed) / power if power > 0.0 else np.inf
+    size = float(np.sqrt(power * (claimed @ claimed)))
     if _is_alike(ratio):
         return
     if size == 0.0 or abs(real @ claimed) < ALIKE * size:
@@ -448,28 +440,21 @@ def _is_alike(ratio: float) -> bool:
     return 1.0 / TOLERANCE < ratio < TOLERANCE
 
 
-def _fit_slope(x: Array, y: Array) -> float:
-    power = float(x @ x)
-    return float(x @ y) / power if power > 0.0 else float("inf")
-
-
-def _estimate_scale(facts: Facts) -> float | None:
+def _turns_against_commands(facts: Facts) -> bool:
     heard = facts.heard.get(CMD_VEL)
     odometry = facts.heard.get(ODOM)
     if heard is None or odometry is None or len(facts.poses) < LEAST_STEPS:
-        return None
-    place = (
-        np.searchsorted(heard.arrivals_ns, odometry.arrivals_ns[:-1], side="right") - 1
-    )
+        return False
+    arrivals = odometry.arrivals_ns[:-1]
+    place = np.searchsorted(heard.arrivals_ns, arrivals, side="right") - 1
     # A car turns the other way in reverse.
     forward = (place >= 0) & (np.array(facts.twists)[:-1, 0] >= 0.0)
     turn = np.asarray(wrap_angle(np.diff(np.array(facts.poses)[:, 2])))[forward]
     commanded = np.array(facts.commands)[place[forward], 2]
     if np.abs(turn).sum() < LEAST_TURN_RAD or np.abs(commanded).sum() < 1.0:
-        return None
+        return False
     power = (commanded @ commanded) * (turn @ turn)
-    correlation = abs(commanded @ turn) / np.sqrt(power)
-    return _fit_slope(commanded, turn) if correlation > LEAST_ALIKE else None
+    return bool(commanded @ turn < -LEAST_ALIKE * np.sqrt(power))
 
 
 def check_layout(facts: Facts, expected: Expected) -> Findings:

@@ -18,7 +18,6 @@ from nics_drl_bridge.identify.report import (
 )
 from nics_drl_bridge.report import fit_pictures, html
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.robot.taylor import TaylorModel
 
 Blocks = Sequence[str]
 Tile = tuple[str, str, bool]
@@ -94,21 +93,6 @@ def model_blocks(spec: RobotSpec, identified: Identified, report: str) -> Blocks
     ]
 
 
-def _make_tiles(model: TaylorModel, conclusion: Conclusion) -> list[Tile]:
-    gaps = len(conclusion.gaps)
-    terms = f"terms of a model with a step of {model.dt:g} s"
-    tiles = [
-        (str(gaps), "gaps in the drive's data", not gaps),
-        (str(model.terms_kept), terms, True),
-    ]
-    assumed = len(model.assumed)
-    if assumed:
-        tiles.append(
-            (str(assumed), "of the terms are assumed from the textbook", False)
-        )
-    return tiles
-
-
 def write_fit_page(
     file: Path, source: str, spec: RobotSpec, identified: Identified, report: str
 ) -> None:
@@ -117,7 +101,17 @@ def write_fit_page(
     folder = file.parent
     # The spec may be of a textbook robot with another state.
     spec = identified.drive.spec
-    figures = [fit_tile(identified), *_make_tiles(identified.model, conclusion)]
+    gaps = len(conclusion.gaps)
+    model = identified.model
+    terms = f"terms of a model with a step of {model.dt:g} s"
+    figures = [
+        fit_tile(identified),
+        (str(gaps), "gaps in the drive's data", not gaps),
+        (str(model.terms_kept), terms, True),
+    ]
+    if model.assumed:
+        meaning = "of the terms are assumed from the textbook"
+        figures.append((str(len(model.assumed)), meaning, False))
     train = f"nics train --robot {folder} --world arena --seeds 0 --out runs/first"
     commands = (train,) if conclusion.ready else ()
     sections = [

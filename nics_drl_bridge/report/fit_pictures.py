@@ -116,39 +116,38 @@ def draw_accuracy(identified: Identified) -> bytes:
 
 def draw_held_out_paths(identified: Identified) -> bytes:
     """Draws open-loop predictions on unseen data and the measured paths from the same starts."""
-    paths = _collect_unseen_paths(identified)
-    rows = -(-len(paths) // 3)
+    drive = identified.drive
+    pose = identified.recording.pose
+    begin_s = identified.train_until_s
+    free = max(drive.duration_s - begin_s - HORIZON_S, 0.0)
+    span = (begin_s, drive.duration_s, HORIZON_S, free / PATHS)
+    chosen = select_windows(drive, identified.calibration, *span)
+    paths = _predict_paths(identified, chosen)[:PATHS]
     columns = min(len(paths), 3)
+    rows = -(-len(paths) // 3)
     figure, grid = make_panels(rows, columns, (3.4 * columns, 3.4 * rows + 0.4))
-    for axes, path in zip(grid, paths, strict=False):
-        _draw_unseen_path(axes, path)
+    for n, (axes, path) in enumerate(zip(grid, paths, strict=False)):
+        during = (pose.t >= chosen.start_t[n]) & (pose.t <= chosen.end_t[n])
+        x, y, _ = pose.values[during].T
+        axes.plot(x, y, label="measured", **MEASURED_LINE)
+        axes.plot(*path[:, :2].T, "--", label="predicted", **MODEL_LINE)
+        axes.plot(x[0], y[0], "o", color=DARK, markersize=5, label="start")
+        axes.set_aspect("equal", adjustable="datalim")
+        distance = float(np.hypot(*(path[-1] - chosen.end[n])[:2]))
+        axes.set_title(f"{distance:.2g} m apart after {HORIZON_S:g} s")
+        axes.set(xlabel="x [m]", ylabel="y [m]")
     return render_png(figure, grid[0])
 
 
-def _collect_unseen_paths(identified: Identified) -> list[tuple[Array, Array, float]]:
-    """Returns measured and predicted paths with the distance between their ends [m]."""
-    drive = identified.drive
-    calibration = identified.calibration
-    pose = identified.recording.pose
-    free = max(drive.duration_s - identified.train_until_s - HORIZON_S, 0.0)
-    span = identified.train_until_s, drive.duration_s
-    chosen = select_windows(drive, calibration, *span, HORIZON_S, free / PATHS)
-    paths = []
-    for n, path in enumerate(_predict_rates(identified, chosen)[:PATHS]):
-        during = (pose.t >= chosen.start_t[n]) & (pose.t <= chosen.end_t[n])
-        distance = float(np.hypot(*(path[-1] - chosen.end[n])[:2]))
-        paths.append((pose.values[during], path, distance))
-    return paths
-
-
-def _draw_unseen_path(axes: Axes, paths: tuple[Array, Array, float]) -> None:
-    truth, path, distance = paths
-    axes.plot(*truth[:, :2].T, label="measured", **MEASURED_LINE)
-    axes.plot(*path[:, :2].T, "--", label="predicted", **MODEL_LINE)
-    axes.plot(*truth[0, :2], "o", color=DARK, markersize=5, label="start")
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set_title(f"{distance:.2g} m apart after {HORIZON_S:g} s")
-    axes.set(xlabel="x [m]", ylabel="y [m]")
+def _predict_paths(identified: Identified, chosen: Windows) -> Array:
+    """Returns predicted poses (N, T, 3) from the start to the end of each window."""
+    poses = [chosen.start]
+    for fraction in np.linspace(0.02, 1.0, PATH_POINTS):
+        end_t = chosen.start_t + fraction * (chosen.end_t - chosen.start_t)
+        window = replace(chosen, end_t=end_t)
+        parts = (identified.model, identified.calibration, identified.drive)
+        poses.append(predict(*parts, window))
+    return np.stack(poses, axis=1)
 
 
 def draw_yardsticks(identified: Identified) -> bytes:
@@ -258,20 +257,6 @@ def _draw_response(
     response_axes.plot(t, twist[shown, d], **MEASURED_LINE)
     model = identified.model
     response_axes.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]", color=MEASURED)
-
-
-def _predict_rates(identified: Identified, chosen: Windows) -> Array:
-    ends = [
-        chosen.start_t + fraction * (chosen.end_t - chosen.start_t)
-        for fraction in np.linspace(0.02, 1.0, PATH_POINTS)
-    ]
-    model = identified.model
-    calibration = identified.calibration
-    drive = identified.drive
-    poses = [
-        predict(model, calibration, drive, replace(chosen, end_t=end)) for end in ends
-    ]
-    return np.stack([chosen.start, *poses], axis=1)
 
 
 def draw_inputs(spec: RobotSpec, identified: Identified) -> bytes | None:

@@ -140,17 +140,16 @@ def drive_picture(pattern: Pattern, spec: RobotSpec) -> bytes:
     figure = Figure(figsize=(11.0, 5.5), layout="constrained")
     grid = figure.add_gridspec(rows, 2, width_ratios=(1.0, 1.2))
     path = figure.add_subplot(grid[:, 0])
-    robot = {"color": GREEN, "alpha": 0.5, "label": "robot at the start"}
-    bound = {"fill": False, "color": MODEL, "linestyle": "--", "label": "bound"}
-    path.add_patch(Circle((0.0, 0.0), pattern.bound, **bound))
-    path.add_patch(Circle((0.0, 0.0), pattern.footprint, **robot))
-    path.plot(
-        pattern.pose[:, 0],
-        pattern.pose[:, 1],
-        color=MEASURED,
-        linewidth=1.0,
-        label="path",
+    origin = (0.0, 0.0)
+    bound = Circle(
+        origin, pattern.bound, fill=False, color=MODEL, linestyle="--", label="bound"
     )
+    path.add_patch(bound)
+    robot = Circle(
+        origin, pattern.footprint, color=GREEN, alpha=0.5, label="robot at the start"
+    )
+    path.add_patch(robot)
+    path.plot(*pattern.pose[:, :2].T, color=MEASURED, linewidth=1.0, label="path")
     path.set(
         aspect="equal", xlabel="x, ahead of the robot [m]", ylabel="y, to its left [m]"
     )
@@ -221,13 +220,17 @@ def _draw_regions(axes: Any, world: World) -> None:
         ("goals", world.goals, GOAL),
     ):
         for number, (x1, y1, x2, y2) in enumerate(places.regions if places else ()):
-            area: dict[str, Any] = {
-                "facecolor": (colour, 0.12),
-                "edgecolor": colour,
-                "ls": "--",
-            }
-            area["label"] = None if number else f"region of {kind}"
-            axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, zorder=0.5, **area))
+            area = Rectangle(
+                (x1, y1),
+                x2 - x1,
+                y2 - y1,
+                facecolor=(colour, 0.12),
+                edgecolor=colour,
+                ls="--",
+                label=None if number else f"region of {kind}",
+                zorder=0.5,
+            )
+            axes.add_patch(area)
 
 
 def draw_seeded_world(
@@ -271,33 +274,32 @@ def _draw_start_and_goal(
     outline: Sequence[tuple[float, float]] | None,
 ) -> None:
     """Draws the robot at its start, and its goal."""
-    look: dict[str, Any] = {
-        "facecolor": MEASURED,
-        "edgecolor": DARK,
-        "label": "robot at its start",
-    }
-    draw_robot(axes, scene.starts[0], footprint, outline, zorder=4.0, **look)
-    look_of_goal: dict[str, Any] = {"marker": "*", "color": GOAL, "edgecolor": DARK}
+    draw_robot(
+        axes,
+        scene.starts[0],
+        footprint,
+        outline,
+        zorder=4.0,
+        facecolor=MEASURED,
+        edgecolor=DARK,
+        label="robot at its start",
+    )
     x, y = scene.goals[0]
-    axes.scatter(x, y, s=320, zorder=5, label="goal", **look_of_goal)
+    look: dict[str, Any] = {"marker": "*", "color": GOAL, "edgecolor": DARK}
+    axes.scatter(x, y, s=320, zorder=5, label="goal", **look)
 
 
 def _draw_movers(axes: Axes, motions: Sequence[Motion | None], scene: Scene) -> None:
     """Draws rings around moving obstacles, and the paths of those that patrol."""
-    moving = [
-        k
-        for k, motion in enumerate(motions)
-        if motion and scene.bodies[k, RADIUS] > 0.0
-    ]
-    ring: dict[str, Any] = {"fill": False, "edgecolor": MODEL, "linewidth": 2.0}
+    moving = [k for k, m in enumerate(motions) if m and scene.bodies[k, RADIUS] > 0.0]
     for number, k in enumerate(moving):
         x, y, radius = scene.bodies[k, [X, Y, RADIUS]]
-        axes.add_patch(
-            Circle((x, y), radius, label=None if number else "moves", **ring)
+        label = None if number else "moves"
+        ring = Circle(
+            (x, y), radius, fill=False, edgecolor=MODEL, linewidth=2.0, label=label
         )
-    patrols = [
-        motion for motion in dict.fromkeys(motions) if isinstance(motion, Patrol)
-    ]
+        axes.add_patch(ring)
+    patrols = [m for m in dict.fromkeys(motions) if isinstance(m, Patrol)]
     for number, patrol in enumerate(patrols):
         path = np.array([*patrol.waypoints, *patrol.waypoints[: int(patrol.loop)]])
         label = None if number else "its path"

@@ -8,7 +8,7 @@ lags more, it gets a separate bound, `TurnBraking`.
 
 import math
 from collections import OrderedDict
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import Any, NamedTuple
 
@@ -148,34 +148,17 @@ class Braking:
         return speed * (self.reaction_s + speed / (2.0 * self.deceleration))
 
 
-class Stops(NamedTuple):
-    """Simulated stops of K motions."""
-
-    twist: Array  # (K, 3) at the command to stop: vx, vy [m/s], wz [rad/s]
-    path: Array  # (K,) length of the path to rest [m]
-    travel: Array  # (K, 3) path of each component: |vx|, |vy| [m], |wz| [rad]
-    last_twist: Array  # (K, 3) at the end of the simulation
-    holds_angle: NDArray[np.bool_]  # (K,) True where steering angles were held
-
-    def select(self, keep: NDArray[np.bool_]) -> "Stops":
-        """Returns the stops that a mask (K,) selects."""
-        return Stops(
-            self.twist[keep],
-            self.path[keep],
-            self.travel[keep],
-            self.last_twist[keep],
-            self.holds_angle[keep],
-        )
-
-    def extend(self, twist: Array, creep: Array, dt: float) -> "Stops":
-        """Returns the stops after another step of dt [s], without the twist (K, 3) of creeping."""
-        speed = np.hypot(twist[:, 0], twist[:, 1])
-        creep_speed = np.hypot(creep[:, 0], creep[:, 1])
-        return self._replace(
-            path=self.path + np.maximum(speed - creep_speed, 0.0) * dt,
-            travel=self.travel + np.maximum(np.abs(twist) - np.abs(creep), 0.0) * dt,
-            last_twist=twist,
-        )
+STOPS = np.dtype(
+    [
+        ("twist", "f8", 3),  # at the command to stop: vx, vy [m/s], wz [rad/s]
+        ("path", "f8"),  # length of the path to rest [m]
+        ("travel", "f8", 3),  # path of each component: |vx|, |vy| [m], |wz| [rad]
+        ("last_twist", "f8", 3),  # at the end of the simulation
+        ("holds_angle", "?"),  # True where steering angles were held
+    ]
+)
+Stops = Any
+"""Simulated stops: a record array (K,) of the type `STOPS`."""
 
 
 def find_braking(
@@ -203,25 +186,14 @@ def find_braking(
         high = robot.command_high
     if ramp is None:
         ramp = np.full(len(low), np.inf)
-    key = _make_cache_key(robot, model, low, high, ramp)
+    parts: list[Any] = [robot.model_dump_json(), low, high, ramp, *vars(model).values()]
+    key = tuple(p.tobytes() if isinstance(p, np.ndarray) else repr(p) for p in parts)
     if key not in _CACHE:
         _CACHE[key] = _bound(robot, model, low, high, ramp)
     _CACHE.move_to_end(key)
     while len(_CACHE) > CACHE_SIZE:
         _CACHE.popitem(last=False)
     return _CACHE[key]
-
-
-def _make_cache_key(
-    robot: RobotSpec,
-    model: TaylorModel,
-    *arrays: Array,
-) -> tuple[Any, ...]:
-    key: list[Any] = [robot.model_dump_json()]
-    for field in fields(model):
-        value = getattr(model, field.name)
-        key.append(value.tobytes() if isinstance(value, np.ndarray) else repr(value))
-    return (*key, *(array.tobytes() for array in arrays))
 
 
 def _bound(
@@ -232,16 +204,16 @@ def _bound(
     ramp: Array,
 ) -> Braking:
     commands = list_motions(low, high)
-    models = [model]
-    slowest = derive_slowest_model(model)
-    if slowest is not None:
-        models.append(slowest)
-    ramped = _simulate_all(robot, models, commands, ramp)
-    sudden = ramped
-    if np.isfinite(ramp).any():
-        sudden = _simulate_all(robot, models, commands, np.full_like(ramp, np.inf))
-    _require_rest(robot, ramped)
-    _require_rest(robot, sudden)
+    models = [*filter(None, (model, derive_slowest_model(model)))]
+    stops = []
+    for limit in (ramp, np.full_like(ramp, np.inf)):
+        parts = [simulate_stops(robot, each, commands, limit) for each in models]
+        stops.append(_join_stops(parts))
+        _require_rest(robot, stops[-1])
+        if np.isinf(ramp).all():
+            break
+    ramped = stops[0]
+    sudden = stops[-1]
     radius = robot.footprint_radius
     shared = fit_bound(ramped, radius, robot.footprint is not None)
     shared = replace(shared, drift=_find_drift(sudden, radius))
@@ -263,25 +235,17 @@ def list_motions(low: Array, high: Array) -> Array:
     levels = (*(-fraction for fraction in fractions), 0.0, *fractions)
     if len(levels) ** count <= MAX_MOTIONS:
         mixed = np.array(list(product(levels, repeat=count)))
-    else:
-        mixed = _combine_pairs(count)
-    single = []
-    for row, fraction in product(np.eye(count), SINGLE_LEVELS):
-        single += [-fraction * row, fraction * row]
-    chosen = np.concatenate([mixed, single])
+    else:  # any two commands at the ends of their ranges
+        mixed = np.array(
+            [
+                first * a + second * b
+                for a, b in combinations(np.eye(count), 2)
+                for first, second in product((-1.0, 1.0), repeat=2)
+            ]
+        )
+    single = np.concatenate([level * np.eye(count) for level in SINGLE_LEVELS])
+    chosen = np.concatenate([mixed, single, -single])
     return np.clip(np.where(chosen < 0.0, -chosen * low, chosen * high), low, high)
-
-
-def _combine_pairs(count: int) -> Array:
-    """Returns fractions (K, C) that put any two commands at the ends of their ranges."""
-    rows = []
-    for i, j in combinations(range(count), 2):
-        for first, second in product((-1.0, 1.0), repeat=2):
-            row = np.zeros(count)
-            row[i] = first
-            row[j] = second
-            rows.append(row)
-    return np.array(rows)
 
 
 def derive_slowest_model(model: TaylorModel) -> TaylorModel | None:
@@ -306,17 +270,6 @@ def derive_slowest_model(model: TaylorModel) -> TaylorModel | None:
     return replace(model, coefficients=model.coefficients * factors[:, None])
 
 
-def _simulate_all(
-    robot: RobotSpec,
-    models: list[TaylorModel],
-    commands: Array,
-    ramp: Array,
-) -> Stops:
-    return _join_stops(
-        [simulate_stops(robot, model, commands, ramp) for model in models]
-    )
-
-
 def simulate_stops(
     robot: RobotSpec,
     model: TaylorModel,
@@ -339,7 +292,7 @@ def simulate_stops(
 
 
 def _join_stops(stops: list[Stops]) -> Stops:
-    return Stops(*(np.concatenate(parts) for parts in zip(*stops, strict=True)))
+    return np.concatenate(stops).view(np.recarray)
 
 
 def _join_inputs(model: TaylorModel, state: Array, command: Array) -> Array:
@@ -400,15 +353,24 @@ def _simulate_stop(
     # A bias of its fit may make a model creep at rest.
     rest_state = _find_steady_states(robot, model, rest)
     creep = model.rates(_join_inputs(model, rest_state, rest))[:, :3]
-    stops = _begin_stops(
-        twist=model.rates(_join_inputs(model, state, commands))[:, :3],
-        is_held=(gap == 0.0) & _select_angles(robot) & (commands != 0.0),
-    )
+    creep_speed = np.hypot(creep[:, 0], creep[:, 1])
+    start = model.rates(_join_inputs(model, state, commands))[:, :3]
+    is_held = (gap == 0.0) & _select_angles(robot) & (commands != 0.0)
+    stops = np.recarray(len(start), STOPS)
+    stops.twist = start
+    stops.path = 0.0
+    stops.travel = 0.0
+    stops.holds_angle = is_held.any(axis=1)
     for step in range(round((MAX_STOP_S + model.delays.max(initial=0.0)) / dt)):
-        change = _compute_change(ramp, model.delays, step, dt)
+        passed = (step + 0.5) * dt - model.delays
+        change = np.where(passed > 0.0, ramp * np.maximum(passed, dt / 2.0), 0.0)
         moved = np.sign(gap) * np.minimum(np.abs(gap), change)
         rates = model.rates(_join_inputs(model, state, commands + moved))
-        stops = stops.extend(rates[:, :3], creep, dt)
+        twist = rates[:, :3]
+        speed = np.hypot(twist[:, 0], twist[:, 1])
+        stops.path += np.maximum(speed - creep_speed, 0.0) * dt
+        stops.travel += np.maximum(np.abs(twist) - np.abs(creep), 0.0) * dt
+        stops.last_twist = twist
         after = np.clip(state + rates[:, 3:] * dt, *model.state_box)
         settled = _is_settled(state, after) and bool((moved == gap).all())
         state = after
@@ -417,26 +379,9 @@ def _simulate_stop(
     return stops
 
 
-def _begin_stops(twist: Array, is_held: NDArray[np.bool_]) -> Stops:
-    """Returns stops from twists (K, 3) at the command to stop; `is_held` (K, C) marks angles."""
-    return Stops(
-        twist=twist,
-        path=np.zeros(len(twist)),
-        travel=np.zeros((len(twist), 3)),
-        last_twist=twist,
-        holds_angle=np.asarray(is_held.any(axis=1)),
-    )
-
-
 def _select_angles(robot: RobotSpec) -> NDArray[np.bool_]:
     """Selects the commands (C,) that are steering angles."""
     return np.array([command.unit == "rad" for command in robot.command])
-
-
-def _compute_change(ramp: Array, delays: Array, step: int, dt: float) -> Array:
-    """Returns how far commands (C,) may have changed in the middle of a step of dt [s]."""
-    passed = (step + 0.5) * dt - delays
-    return np.where(passed > 0.0, ramp * np.maximum(passed, dt / 2.0), 0.0)
 
 
 def _require_rest(robot: RobotSpec, stops: Stops) -> None:
@@ -470,54 +415,30 @@ def fit_bound(stops: Stops, radius: float, turns_count: bool) -> Braking:
         turns_count: True if a turn alone sweeps new ground, because the footprint has corners.
     """
     is_moving = _measure_speed(stops) + radius * np.abs(stops.twist[:, 2]) > CREEP
-    stops = stops.select(is_moving)
-    if not len(stops.path):
+    stops = stops[is_moving]
+    if not len(stops):
         return Braking(0.0, math.inf)
-    sweep = _measure_sweep(stops, radius)
+    # What the fastest point of the footprint sweeps; slack counts on straight ways.
+    speed = _measure_speed(stops)
     turn_speed = radius * np.abs(stops.twist[:, 2])
+    swept = stops.path + radius * stops.travel[:, 2]
+    is_straight = turn_speed <= STRAIGHT * speed
+    if not is_straight.any():
+        is_straight[:] = True
     bounds = []
-    fits = []
     for lever, order in product(LEVERS, _list_orders(stops)):
         bound = Braking(0.0, 1.0, lever * radius, order=order)
-        bounds.append(bound)
         pace = bound.pace(stops.twist)
         if turns_count:
             pace = np.maximum(pace, turn_speed)
-        fits.append(_fit_tightest(sweep, pace))
-    # the first one that is nearly as tight as the tightest
-    max_slack = min(fit.slack for fit in fits) + NEGLIGIBLE
-    return next(
-        _round_bound(bound, fit)
-        for bound, fit in zip(bounds, fits, strict=True)
-        if fit.slack <= max_slack
-    )
+        fit = _fit_tightest(speed + turn_speed, pace, swept, is_straight)
+        bounds.append((bound, fit))
+    return _choose_bound(bounds, NEGLIGIBLE)
 
 
 def _measure_speed(stops: Stops) -> Array:
     """Returns the speeds (K,) at the command to stop [m/s]."""
-    return np.hypot(stops.twist[:, 0], stops.twist[:, 1])
-
-
-class _Sweep(NamedTuple):
-    """What K stops sweep, as `_fit_tightest` bounds it."""
-
-    speed: Array  # (K,) at the command to stop [m/s or rad/s]
-    distance: Array  # (K,) to rest [m or rad]
-    counts: NDArray[np.bool_]  # (K,) True where the slack of a bound counts
-    worst: Array  # distances relative to which it counts
-
-
-def _measure_sweep(stops: Stops, radius: float) -> _Sweep:
-    """Returns what the fastest point of the footprint sweeps; slack counts on straight ways."""
-    speed = _measure_speed(stops)
-    turn_speed = radius * np.abs(stops.twist[:, 2])
-    whole = speed + turn_speed
-    distance = stops.path + radius * stops.travel[:, 2]
-    straight = turn_speed <= STRAIGHT * speed
-    if not straight.any():
-        straight = np.ones_like(straight)
-    worst = _compute_envelope(whole[straight], distance[straight])
-    return _Sweep(whole, distance, straight, worst)
+    return np.asarray(np.hypot(stops.twist[:, 0], stops.twist[:, 1]))
 
 
 def _list_orders(stops: Stops) -> tuple[float, ...]:
@@ -536,15 +457,20 @@ class _Fit(NamedTuple):
     inverse: float  # half the inverse of the deceleration [s^2/m]
 
 
-def _round_bound(bound: Braking, fit: _Fit) -> Braking:
-    """Returns a bound rounded to whole milliseconds and three digits of the deceleration."""
+def _choose_bound(bounds: list[tuple[Braking, _Fit]], slack: float = 0.0) -> Braking:
+    """Returns the first bound that has at most some slack more than the tightest one.
+
+    It is rounded to whole milliseconds and three digits of the deceleration.
+    """
+    max_slack = min(fit.slack for _, fit in bounds) + slack
+    bound, fit = next(pair for pair in bounds if pair[1].slack <= max_slack)
     reaction_s = math.ceil(1e3 * fit.reaction_s - 1e-3) / 1e3
-    if fit.inverse < INSTANT:
-        return replace(bound, reaction_s=reaction_s, deceleration=math.inf)
-    deceleration = 0.5 / fit.inverse
-    digit = 10.0 ** (math.floor(math.log10(deceleration)) - 2)
-    deceleration = math.floor(deceleration / digit + 1e-3) * digit
-    deceleration = float(f"{deceleration:.3g}")
+    deceleration = math.inf
+    if fit.inverse >= INSTANT:
+        deceleration = 0.5 / fit.inverse
+        digit = 10.0 ** (math.floor(math.log10(deceleration)) - 2)
+        deceleration = math.floor(deceleration / digit + 1e-3) * digit
+        deceleration = float(f"{deceleration:.3g}")
     return replace(bound, reaction_s=reaction_s, deceleration=deceleration)
 
 
@@ -556,32 +482,37 @@ def _compute_envelope(speed: Array, distance: Array) -> Array:
     return envelope
 
 
-def _fit_tightest(sweep: _Sweep, pace: Array) -> _Fit:
+def _fit_tightest(
+    speed: Array,
+    pace: Array,
+    distance: Array,
+    counts: NDArray[np.bool_] | None = None,
+) -> _Fit:
     """Fits distance <= speed * (reaction + pace * inverse) for all stops, with minimum slack.
 
-    The slack is the mean excess over the `worst` distances, as a fraction.
+    The slack is the mean excess of the bound, as a fraction: over all distances, or over the worst
+    ones of no higher speed where it `counts` (K,).
     """
-    weight = 1.0 / (sweep.worst + SLACK_M)
-    ahead = sweep.speed[sweep.counts] * weight
-    cost = np.array([ahead.mean(), (ahead * pace[sweep.counts]).mean()])
-    rows = np.stack([-sweep.speed, -sweep.speed * pace], axis=-1)
-    times = sweep.distance / sweep.speed
-    result = scipy.optimize.linprog(cost, rows, -sweep.distance, bounds=(0.0, None))
+    worst = distance
+    counted_speed = speed
+    counted_pace = pace
+    if counts is not None:
+        counted_speed = speed[counts]
+        counted_pace = pace[counts]
+        worst = _compute_envelope(counted_speed, distance[counts])
+    weight = 1.0 / (worst + SLACK_M)
+    ahead = counted_speed * weight
+    cost = np.array([ahead.mean(), (ahead * counted_pace).mean()])
+    times = distance / speed
+    rows = np.stack([-speed, -speed * pace], axis=-1)
+    result = scipy.optimize.linprog(cost, rows, -distance, bounds=(0.0, None))
     if not result.success:
-        return _Fit(
-            slack=math.inf,
-            reaction_s=float(times.max()),
-            inverse=0.0,
-        )
+        return _Fit(slack=math.inf, reaction_s=float(times.max()), inverse=0.0)
     reaction, inverse = result.x
-    slack = float(cost @ result.x - (sweep.worst * weight).mean())
+    slack = float(cost @ result.x - (worst * weight).mean())
     # The solver meets each bound up to its tolerance.
-    missing = float((times - reaction - pace * inverse).max())
-    return _Fit(
-        slack=slack,
-        reaction_s=float(reaction) + max(missing, 0.0),
-        inverse=float(inverse),
-    )
+    reaction += max((times - reaction - pace * inverse).max(), 0.0)
+    return _Fit(slack, float(reaction), float(inverse))
 
 
 def fit_separate_bounds(stops: Stops, radius: float) -> Braking | None:
@@ -596,8 +527,17 @@ def fit_separate_bounds(stops: Stops, radius: float) -> Braking | None:
     turns = radius * rate > CREEP
     if not (moves.any() and turns.any()):
         return None
-    bound = _fit_path(stops.select(moves))
-    turn = _fit_turn(stops.select(turns))
+    moving = stops[moves]
+    bounds = []
+    for order in _list_orders(moving):
+        bound = Braking(0.0, 1.0, order=order)
+        pace = bound.pace(moving.twist)
+        bounds.append((bound, _fit_tightest(_measure_speed(moving), pace, moving.path)))
+    bound = _choose_bound(bounds)
+    turning = rate[turns]
+    fit = _fit_tightest(turning, turning, stops.travel[turns, 2])
+    of_turn = _choose_bound([(Braking(0.0, 1.0), fit)])
+    turn = TurnBraking(of_turn.reaction_s, of_turn.deceleration)
     turned = stops.travel[:, 2]
     max_path = _bound_path(bound, stops.twist)
     max_turn = rate * turn.mean_time_s(rate)
@@ -614,23 +554,6 @@ def fit_separate_bounds(stops: Stops, radius: float) -> Braking | None:
     return replace(bound, turn=turn)
 
 
-def _fit_path(stops: Stops) -> Braking:
-    """Returns the tightest bound on the paths of moving robots, whatever they turn."""
-    speed = _measure_speed(stops)
-    bounds = [Braking(0.0, 1.0, order=order) for order in _list_orders(stops)]
-    fits = [_fit_alone(speed, bound.pace(stops.twist), stops.path) for bound in bounds]
-    best = min(range(len(fits)), key=lambda i: fits[i].slack)
-    return _round_bound(bounds[best], fits[best])
-
-
-def _fit_turn(stops: Stops) -> TurnBraking:
-    """Returns the tightest bound on the turns of turning robots, however they move."""
-    rate = np.abs(stops.twist[:, 2])
-    fit = _fit_alone(rate, rate, stops.travel[:, 2])
-    bound = _round_bound(Braking(0.0, 1.0), fit)
-    return TurnBraking(bound.reaction_s, bound.deceleration)
-
-
 def _find_min_fraction(distance: Array, bound: Array) -> float:
     """Returns the minimum ratio of distances (K,) to their bounds (K,).
 
@@ -640,12 +563,6 @@ def _find_min_fraction(distance: Array, bound: Array) -> float:
         distance, bound, out=np.ones_like(distance), where=bound > 0.0
     )
     return float(np.clip(fractions.min(), MIN_FRACTION, 1.0))
-
-
-def _fit_alone(speed: Array, pace: Array, distance: Array) -> _Fit:
-    """Does the same as `_fit_tightest` for one component, which counts at all speeds."""
-    counts = np.ones(len(speed), np.bool_)
-    return _fit_tightest(_Sweep(speed, distance, counts, distance), pace)
 
 
 def _bound_path(bound: Braking, twist: Array) -> Array:
@@ -686,8 +603,4 @@ def _find_drift(stops: Stops, radius: float) -> Drift:
     if low > 1.0 - ALIKE and high < 1.0 + ALIKE:
         return NO_DRIFT
     fraction = float((ratios * fractions)[counts].max())
-    return Drift(
-        least=min(low, 1.0),
-        greatest=max(high, 1.0),
-        share=max(fraction, 1.0),
-    )
+    return Drift(least=min(low, 1.0), greatest=max(high, 1.0), share=max(fraction, 1.0))

@@ -113,10 +113,10 @@ def place_wheels(
     )
     if turns:
         names = tuple(v.name for v in spec.state)
-    wheels = []
-    for name, place in zip(names, places, strict=True):
-        wheels.append(Wheel(name, place, radius, turns=turns))
-    return tuple(wheels)
+    return tuple(
+        Wheel(name, place, radius, turns=turns)
+        for name, place in zip(names, places, strict=True)
+    )
 
 
 def places_of_four(parameters: Mapping[str, float]) -> dict[str, tuple[float, float]]:
@@ -125,20 +125,16 @@ def places_of_four(parameters: Mapping[str, float]) -> dict[str, tuple[float, fl
     They stand at `half_length` and `half_width`, each by default half a `track`. Raises KeyError if
     these are unknown.
     """
-    x = _read_half(parameters, "half_length")
-    y = _read_half(parameters, "half_width")
+    x, y = (
+        parameters[name] if name in parameters else 0.5 * parameters["track"]
+        for name in ("half_length", "half_width")
+    )
     return {
         "front_left": (x, y),
         "front_right": (x, -y),
         "rear_left": (-x, y),
         "rear_right": (-x, -y),
     }
-
-
-def _read_half(parameters: Mapping[str, float], name: str) -> float:
-    if name in parameters:
-        return parameters[name]
-    return 0.5 * parameters["track"]
 
 
 @dataclass(frozen=True)
@@ -179,17 +175,13 @@ def textbook(spec: RobotSpec) -> Textbook:
 
 def find_actuator_kinematics(spec: RobotSpec) -> Textbook:
     """Returns the textbook kinematics of the actuators. Raises ConfigError like `textbook`."""
-
-    def make(kind: RobotKind) -> Textbook:
-        if kind.kinematics is None:
-            raise ConfigError(
-                f"robot {spec.name!r}: the kind {spec.textbook!r} has no textbook "
-                "kinematics; use a recording and its model instead, or choose another "
-                "kind."
-            )
-        return kind.kinematics(spec)
-
-    return _apply_to_kind(spec, make)
+    book = _apply_to_kind(spec, lambda kind: kind.kinematics and kind.kinematics(spec))
+    if book is None:
+        raise ConfigError(
+            f"robot {spec.name!r}: the kind {spec.textbook!r} has no textbook "
+            "kinematics; use a recording and its model instead, or choose another kind."
+        )
+    return book
 
 
 def has_textbook(spec: RobotSpec) -> bool:
@@ -199,20 +191,21 @@ def has_textbook(spec: RobotSpec) -> bool:
 
 def _add_lags(spec: RobotSpec, book: Textbook) -> Textbook:
     """Returns the kinematics of a robot whose state is its twist, which lags like its actuators."""
-    dofs = [POSE_RATES.index(v.twist) for v in spec.state if v.twist is not None]
     if book.limited.any():
         raise ConfigError(
             f"robot {spec.name!r}: a rate limit of an actuator needs the actuators as "
             "state; give lags, or correct `state:`."
         )
-    lag = np.zeros(len(dofs))
-    for i, v in enumerate(spec.state):
-        # Speeds take the lag of the first actuator, turn rates the lag of the last one (steering).
-        actuator = -1 if dofs[i] == 2 else 0
-        lag[i] = spec.parameters.get(f"{v.name}_lag", book.lag[actuator])
+    dofs = []
+    lags = []
     structure: dict[str, tuple[str, ...]] = dict.fromkeys(POSE_RATES, ())
     for v in spec.state:
-        structure[str(v.twist)] = (v.name,)
+        twist = v.twist or "vx"
+        dofs.append(POSE_RATES.index(twist))
+        # Speeds take the lag of the first actuator, turn rates the lag of the last one (steering).
+        actuator = -1 if twist == "wz" else 0
+        lags.append(spec.parameters.get(f"{v.name}_lag", book.lag[actuator]))
+        structure[twist] = (v.name,)
 
     def compose_twist(state: Array) -> Array:
         twist = np.zeros((*state.shape[:-1], 3))
@@ -222,8 +215,8 @@ def _add_lags(spec: RobotSpec, book: Textbook) -> Textbook:
     return Textbook(
         twist=compose_twist,
         target=lambda command: book.compute_twist(command)[..., dofs],
-        lag=lag,
-        rate=np.full(len(lag), np.inf),
+        lag=np.array(lags),
+        rate=np.full(len(lags), np.inf),
         structure=structure,
         command=book.command,
     )
@@ -263,17 +256,24 @@ def require_textbook(spec: RobotSpec) -> str:
     return spec.textbook
 
 
+def _choose_conversion(spec: RobotSpec) -> RobotSpec | Textbook:
+    """Returns what converts between a robot's commands and its twist."""
+    if is_twist_commanded(spec):
+        return spec
+    if spec.textbook is None and spec.steers:
+        return spec.model_copy(update={"angular_is": "turn_rate"})
+    return find_actuator_kinematics(spec)
+
+
 def compute_steady_twist(spec: RobotSpec, command: ArrayLike) -> Array:
     """Returns the body twist (..., 3) to which held commands (..., C) lead.
 
     Raises ConfigError if kinematics or wheelbase are needed but unknown.
     """
-    if is_twist_commanded(spec):
-        return spec.to_cmd_vel(command)
-    if spec.textbook is None and spec.steers:
-        return _use_turn_rate(spec).to_cmd_vel(command)
-    book = find_actuator_kinematics(spec)
-    return book.compute_twist(np.asarray(command, dtype=np.float64))
+    conversion = _choose_conversion(spec)
+    if isinstance(conversion, RobotSpec):
+        return conversion.to_cmd_vel(command)
+    return conversion.compute_twist(np.asarray(command, dtype=np.float64))
 
 
 def find_command(spec: RobotSpec, twist: ArrayLike) -> Array:
@@ -282,20 +282,17 @@ def find_command(spec: RobotSpec, twist: ArrayLike) -> Array:
     A car that should turn on the spot stops instead. Raises ConfigError like
     `compute_steady_twist`.
     """
+    conversion = _choose_conversion(spec)
     twist = np.asarray(twist, dtype=np.float64)
-    if is_twist_commanded(spec):
-        command = spec.from_cmd_vel(twist)
-    elif spec.textbook is None and spec.steers:
-        command = _use_turn_rate(spec).from_cmd_vel(twist)
+    if isinstance(conversion, RobotSpec):
+        command = conversion.from_cmd_vel(twist)
+    elif conversion.command is not None:
+        command = conversion.command(twist)
     else:
-        book = find_actuator_kinematics(spec)
-        if book.command is None:
-            raise ConfigError(
-                f"robot {spec.name!r}: the kind {spec.textbook!r} does not define "
-                "which command leads to a twist; use continuous actions and no "
-                "planner."
-            )
-        command = book.command(twist)
+        raise ConfigError(
+            f"robot {spec.name!r}: the kind {spec.textbook!r} does not define which "
+            "command leads to a twist; use continuous actions and no planner."
+        )
     return np.clip(command, spec.command_low, spec.command_high)
 
 
@@ -310,10 +307,8 @@ def _combine_ends(spec: RobotSpec) -> Array:
 
     More than `MAX_VARIED` commands are not combined: all are at the same end.
     """
-    low = spec.command_low
-    high = spec.command_high
-    rest = np.clip(np.zeros(len(low)), low, high)
-    ends = np.stack([low, rest, high])
+    rest = np.clip(0.0, spec.command_low, spec.command_high)
+    ends = np.stack([spec.command_low, rest, spec.command_high])
     if ends.shape[1] > MAX_VARIED:
         return ends
     return np.array(list(product(*ends.T)))
@@ -335,10 +330,6 @@ def describe_overdrive(spec: RobotSpec) -> str | None:
                 "limits of the state."
             )
     return None
-
-
-def _use_turn_rate(spec: RobotSpec) -> RobotSpec:
-    return spec.model_copy(update={"angular_is": "turn_rate"})
 
 
 def is_twist_commanded(spec: RobotSpec) -> bool:
@@ -413,9 +404,15 @@ def make_wheeled(
             "correct `state:`.",
         )
     dofs = [POSE_RATES.index(dof) for dof in moves]
-    columns, wheels_from_command, command_from_twist = _read_wheeled_commands(
-        spec, dofs, inverse, wheels
-    )
+    fields = tuple(specs.CMD_VEL_FIELDS[dof] for dof in dofs)
+    wheels_from_command = inverse
+    command_from_twist = np.eye(len(dofs))
+    if all(c.unit == "rad/s" and c.cmd_vel is None for c in spec.command):
+        columns = _find_columns(spec, fields, wheels, len(inverse))
+        wheels_from_command = np.eye(len(inverse))
+        command_from_twist = inverse
+    else:
+        columns = _find_columns(spec, fields, (), len(dofs))
     slip_factors = np.array([1.0, 1.0, slip])
     twist_from_wheels = forward * slip_factors[:, None]
     if _has_actuator_state(spec):
@@ -434,21 +431,6 @@ def make_wheeled(
         structure={dof: wheels if dof in moves else () for dof in POSE_RATES},
         command=compute_command,
     )
-
-
-def _read_wheeled_commands(
-    spec: RobotSpec, dofs: list[int], inverse: Array, wheels: tuple[str, ...]
-) -> tuple[list[int], Array, Array]:
-    """Returns the commands' indices, and the matrices to wheel speeds and from the twist.
-
-    See `make_wheeled`.
-    """
-    fields = tuple(specs.CMD_VEL_FIELDS[dof] for dof in dofs)
-    if all(c.unit == "rad/s" and c.cmd_vel is None for c in spec.command):
-        columns = _find_columns(spec, fields, wheels, len(inverse))
-        return columns, np.eye(len(inverse)), inverse
-    columns = _find_columns(spec, fields, (), len(dofs))
-    return columns, inverse, np.eye(len(dofs))
 
 
 def _has_actuator_state(spec: RobotSpec) -> bool:
@@ -506,8 +488,7 @@ def _find_state_places(spec: RobotSpec) -> tuple[int, int]:
 
 
 def _read_actuators(
-    parameters: dict[str, float],
-    parts: tuple[str, ...],
+    parameters: dict[str, float], parts: tuple[str, ...]
 ) -> tuple[Array, Array]:
     """Returns lags [s] and rate limits of actuators; each has one or the other."""
     lag = np.ones(len(parts))

@@ -184,8 +184,7 @@ class RobotSpec(Schema):
 
     @model_serializer(mode="wrap")
     def _drop_none(
-        self,
-        dump: pydantic.SerializerFunctionWrapHandler,
+        self, dump: pydantic.SerializerFunctionWrapHandler
     ) -> dict[str, Any]:
         # Models and policies are identified by their content, so an empty key must not change it.
         data: dict[str, Any] = dump(self)
@@ -240,22 +239,25 @@ class RobotSpec(Schema):
 
     @model_validator(mode="after")
     def _check_variables(self) -> "RobotSpec":
-        names = self.variable_names
-        if len(set(names)) != len(names):
-            raise ValueError("every state and command variable needs a unique name")
+        fields = [c.cmd_vel for c in self.command]
+        twists = [v.twist for v in self.state]
+        for names, fault in (
+            (
+                self.variable_names,
+                "every state and command variable needs a unique name",
+            ),
+            (fields, "two commands share one field of cmd_vel"),
+            (twists, "two states are the same component of the twist"),
+        ):
+            given = [name for name in names if name is not None]
+            if len(set(given)) < len(given):
+                raise ValueError(fault)
         commands = [c.name for c in self.command]
         for v in self.state:
             if v.follows is not None and v.follows not in commands:
                 raise ValueError(
                     f"state {v.name!r} follows {v.follows!r}, which is not a command"
                 )
-        fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
-        if len(set(fields)) != len(fields):
-            raise ValueError("two commands share one field of cmd_vel")
-        twists = [v.twist for v in self.state if v.twist is not None]
-        if len(set(twists)) != len(twists):
-            raise ValueError("two states are the same component of the twist")
-        for v in self.state:
             if v.twist is not None and v.unit != DOF_UNITS[v.twist]:
                 raise ValueError(
                     f"state {v.name!r} is {v.twist} of the twist, so its unit is "
@@ -359,6 +361,7 @@ class RobotSpec(Schema):
 
     @cached_property
     def _cmd_vel_index(self) -> NDArray[np.intp]:
+        places = []
         for command in self.command:
             if command.cmd_vel is None:
                 raise ConfigError(
@@ -366,8 +369,8 @@ class RobotSpec(Schema):
                     "of cmd_vel; add `cmd_vel:` to it, or drive it in process, "
                     "without ROS 2."
                 )
-        fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
-        return np.array([CMD_VEL_FIELDS.index(f) for f in fields], dtype=np.intp)
+            places.append(CMD_VEL_FIELDS.index(command.cmd_vel))
+        return np.array(places, dtype=np.intp)
 
     @property
     def cmd_vel_places(self) -> tuple[int, ...]:
@@ -453,8 +456,7 @@ def load_robot(name: str | Path) -> RobotSpec:
 
 
 def build_robot(
-    definition: str | Path | Mapping[str, Any],
-    ranges: Ranges | None = None,
+    definition: str | Path | Mapping[str, Any], ranges: Ranges | None = None
 ) -> RobotSpec:
     """Builds a robot from a shipped robot's name, the path of a YAML file, or its content.
 
@@ -491,9 +493,7 @@ def read_definition(definition: str | Path | Mapping[str, Any]) -> dict[str, Any
 
 
 def _fill_from_kind(
-    data: dict[str, Any],
-    ranges: Ranges,
-    source: str,
+    data: dict[str, Any], ranges: Ranges, source: str
 ) -> dict[str, Any]:
     kind = find_kind(str(data["kind"]))
     if kind is None:

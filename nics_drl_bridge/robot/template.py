@@ -19,10 +19,7 @@ RATIO_RANGE = 1.0  # range of a command without a unit, in both directions
 
 
 def make_command(
-    name: str,
-    unit: str,
-    limit: float,
-    field: str | None = None,
+    name: str, unit: str, limit: float, field: str | None = None
 ) -> dict[str, Any]:
     """Returns a command of a template, with a range of `limit` in both directions."""
     command = {"name": name, "unit": unit, "min": -limit, "max": limit}
@@ -109,20 +106,17 @@ class Template:
         command = robot.get("command")
         if command is not None and not _is_mappings(command):
             return command  # validation of the whole file reports it
-        if command is None:
-            names: list[Any] = list(ranges)
-        else:
+        names: list[Any] = list(ranges)
+        if command is not None:
             names = [part.get("name") for part in command]
-        usual = max(
-            self.commands,
-            key=lambda commands: _count_matches(commands, names, command or ()),
-            default=(),
-        )
-        by_name = {}
-        for part in usual:
-            by_name[part["name"]] = part
-        for part in usual:
-            by_name[part["name"].removesuffix("_command")] = part
+        units = [part.get("unit") for part in command or ()]
+
+        def count_matches(commands: Sequence[Part]) -> int:
+            return sum(c["name"] in names or c["unit"] in units for c in commands)
+
+        usual = max(self.commands, key=count_matches, default=())
+        by_name = {part["name"]: part for part in usual}
+        by_name |= {part["name"].removesuffix("_command"): part for part in usual}
         if command is None and usual and ranges:
             fits = all(by_name.get(name) in usual for name in names)
             if not fits or len(usual) != len(names):
@@ -174,25 +168,10 @@ class Template:
 
 def _is_mappings(parts: Any) -> bool:
     """True for a sequence of mappings that contain no lists or mappings."""
-    if not isinstance(parts, list | tuple):
-        return False
-    for part in parts:
-        if not isinstance(part, Mapping):
-            return False
-        if any(isinstance(value, list | dict) for value in part.values()):
-            return False
-    return True
-
-
-def _count_matches(
-    commands: Sequence[Part],
-    names: Sequence[Any],
-    parts: Sequence[Part],
-) -> int:
-    """Counts the commands that are given by name or by unit."""
-    units = [part.get("unit") for part in parts]
-    return sum(
-        command["name"] in names or command["unit"] in units for command in commands
+    return isinstance(parts, list | tuple) and all(
+        isinstance(part, Mapping)
+        and not any(isinstance(value, list | dict) for value in part.values())
+        for part in parts
     )
 
 
@@ -218,15 +197,11 @@ def _complete_state(state: Part, command: Sequence[Part]) -> dict[str, Any]:
     unit, limit = TWIST_RANGES.get(state.get("twist", ""), (None, None))
     unit = state.get("unit", unit)
     follows = state.get("follows")
-    if follows:
-        related = [part for part in command if part.get("name") == follows]
-    else:
-        related = [
-            part for part in command if part.get("unit") == unit and part.get("cmd_vel")
-        ]
     ends: list[Any] = []
-    for part in related:
-        ends += [part.get("min"), part.get("max")]
+    for part in command:
+        is_alike = part.get("unit") == unit and part.get("cmd_vel")
+        if part.get("name") == follows if follows else is_alike:
+            ends += [part.get("min"), part.get("max")]
     sizes = [abs(end) for end in ends if isinstance(end, int | float)]
     if sizes:
         limit = STATE_RANGE_FACTOR * max(sizes)

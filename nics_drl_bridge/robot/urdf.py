@@ -36,11 +36,17 @@ def make_urdf(
     if spec.textbook is not None:
         drawing = draw_robot(spec)
     collision = f"<collision>{_write_footprint(spec)}</collision>"
-    parts.append(_write_link(base, collision + _write_body(drawing)))
+    body = drawing.body if isinstance(drawing.body, tuple) else (drawing.body,)
+    x, height = drawing.centre
+    visual = _write_visual("body", (*body, BODY_HEIGHT), (x, 0.0, height))
+    parts.append(_write_link(base, collision + visual))
     parts += [_write_wheel(base, wheel) for wheel in drawing.wheels]
     for frame, place in {laser: mount, **(further or {})}.items():
         joint = "laser_mount" if frame == laser else f"{frame}_mount"
-        parts.append(_write_sensor(joint, base, frame, place))
+        x, y, yaw = place
+        visual = _write_visual("laser", (0.02, 0.03), (0.0, 0.0, 0.07))
+        parts.append(_write_link(frame, visual))
+        parts.append(_write_joint(joint, "fixed", base, frame, (x, y, 0.0), yaw))
     robot = f"<robot name={quoteattr(spec.name)}>{''.join(parts)}</robot>"
     root = ElementTree.fromstring(robot)  # noqa: S314 - written above
     ElementTree.indent(root)
@@ -56,21 +62,6 @@ def _write_footprint(spec: RobotSpec) -> str:
     size = (max(x) - min(x), max(y) - min(y), BODY_HEIGHT)
     middle = (0.5 * (min(x) + max(x)), 0.5 * (min(y) + max(y)), BODY_HEIGHT)
     return _write_shape(size, middle)
-
-
-def _write_sensor(joint: str, base: str, frame: str, mount: Place) -> str:
-    """Returns a sensor at its mount: x [m], y [m], heading [rad]."""
-    x, y, yaw = mount
-    visual = _write_visual("laser", (0.02, 0.03), (0.0, 0.0, 0.07))
-    fixed = _write_joint(joint, "fixed", base, frame, (x, y, 0.0), yaw)
-    return _write_link(frame, visual) + fixed
-
-
-def _write_body(drawing: Drawing) -> str:
-    """Returns the box or disc of a drawing."""
-    body = drawing.body if isinstance(drawing.body, tuple) else (drawing.body,)
-    x, height = drawing.centre
-    return _write_visual("body", (*body, BODY_HEIGHT), (x, 0.0, height))
 
 
 def _write_wheel(parent: str, wheel: Wheel) -> str:

@@ -1,7 +1,5 @@
 """Tables for tests: a drive as columns, written as users have them, drafted and read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

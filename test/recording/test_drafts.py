@@ -1,7 +1,5 @@
 """Drafts of mappings in the styles of public data sets: right or blank, and never wrong."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Drafts of mappings for bags of usual robots: types and names of topics decide."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest
@@ -11,14 +9,14 @@ from nics_drl_bridge.recording import topic_roles as kinds
 from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.survey import Field, TableSurvey
 
-from .test_drafts import COUNT, M
+from .test_drafts import M
 
 
 def topic(name: str, kind: str, columns: dict[str, str]) -> TableSurvey:
-    data = {field: M[column] for field, column in columns.items()}
-    table = TableSurvey(name, COUNT, t=M["t"], data=data, kind=kind, is_single=False)
-    for field, c in data.items():
-        table.columns.append(Field(table, field, float(c.min()), float(c.max())))
+    table = TableSurvey(name, kind, t=M["t"], is_single=False)
+    table.columns += [
+        Field(table, field, M[column]) for field, column in columns.items()
+    ]
     return table
 
 
@@ -116,11 +114,7 @@ BAGS: dict[str, tuple[list[TableSurvey], str, str]] = {
         "/lwheel_vtarget:data /rwheel_vtarget:data",
     ),
     "a car's measured steering": ([odometry(), ackermann("/ack_odom")], "/odom", ""),
-    "joints": (
-        [odometry(), topic("/joint_states", kinds.JOINTS, JOINTS)],
-        "/odom",
-        "",
-    ),
+    "joints": ([odometry(), topic("/joint_states", kinds.JOINTS, JOINTS)], "/odom", ""),
     "wheels": (
         [
             pose("/vrpn/robot/pose"),

@@ -1,7 +1,5 @@
 """The example mappings, on the real recordings that they are of."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

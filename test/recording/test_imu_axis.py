@@ -1,7 +1,5 @@
 """The yaw rate of an IMU is about the axis that points up by gravity, however it is mounted."""
 
-from __future__ import annotations
-
 import bags
 import numpy as np
 import pytest

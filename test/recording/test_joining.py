@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -129,8 +127,7 @@ def test_a_draft_names_the_column_that_numbers_episodes(
 
 
 @pytest.mark.parametrize(
-    "values",
-    [np.repeat([0, 1, 0], [400, 400, 200]), np.arange(1000), np.zeros(1000)],
+    "values", [np.repeat([0, 1, 0], [400, 400, 200]), np.arange(1000), np.zeros(1000)]
 )
 def test_a_draft_leaves_out_a_column_that_numbers_no_episodes(tmp_path, values):
     path = write(tmp_path / "log.csv", drive(1000) | {"episode": values})

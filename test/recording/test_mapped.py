@@ -1,15 +1,10 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from nics_drl_bridge.config import dump_yaml, parse_yaml
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.mapping import load_mapping
-from nics_drl_bridge.recording.readers import (
-    open_drive,
-    reorder_variables,
-)
+from nics_drl_bridge.recording.readers import open_drive, reorder_variables
 from nics_drl_bridge.recording.recording import save_recording
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -220,56 +215,55 @@ def spoil(columns):
     return columns | more
 
 
-@pytest.mark.parametrize(
-    ("changes", "fix"),
-    [
-        ("time: null", "`time: t`"),
-        ("time: ms", "`time: {from: ms, unit: ms}`"),
-        ("time: still", "all of its stamps are 0 s"),
-        ("time: short", "`unit:` of its `time:`"),
-        ("time: sec", "`time: [sec, nanosec]`"),
-        ("{time: sec, in: log.csv}", "of 50 rows each"),
-        ("command: {v: vv}", "did you mean 'v'?"),
-        ('command: {v: "other.csv:v"}', "has no 'other.csv'"),
-        ("command: {v: {from: v, time: later}}", "separate `clock:`"),
-        ("command: {v: {from: v, when: {w: 7}}}", "w is 7.0"),
-        ("command: {v: {from: count, unit: rpm}}", "{from: count, unit: ticks, "),
-        ("command: {v: back}", "{from: back, unit: ticks, "),
-        ("command: {v: {from: back, unit: m/s}}", "went on by 7960"),
-        ("command: {v: lat}", "'lat' looks like a latitude or longitude, which was"),
-        ("command: {v: 6}", "'cov_xx' shows how uncertain a measurement is"),
-        ("command: {v: {from: noisy, unit: ticks}}", "`unit: ticks/s`"),
-        ("pose: {x: x, y: y, heading: deg}", "`heading_unit: deg`"),
-        ("pose: {x: mm, y: mm, heading: yaw}", "`unit: mm`"),
-        ("pose: {x: x, y: y, quaternion: [x, y, x, y]}", "order x, y, z, w"),
-        (
-            "pose: {x: x, y: y, quaternion: [qw, zero, zero, qz]}",
-            "look like w, x, y, z",
-        ),
-    ],
-)
+WRONG = """
+time: null -> `time: t`
+time: ms -> `time: {from: ms, unit: ms}`
+time: still -> all of its stamps are 0 s
+time: short -> `unit:` of its `time:`
+time: sec -> `time: [sec, nanosec]`
+{time: sec, in: log.csv} -> of 50 rows each
+command: {v: vv} -> did you mean 'v'?
+command: {v: "other.csv:v"} -> has no 'other.csv'
+command: {v: {from: v, time: later}} -> separate `clock:`
+command: {v: {from: v, when: {w: 7}}} -> w is 7.0
+command: {v: {from: count, unit: rpm}} -> {from: count, unit: ticks,
+command: {v: back} -> {from: back, unit: ticks,
+command: {v: {from: back, unit: m/s}} -> went on by 7960
+command: {v: lat} -> 'lat' looks like a latitude or longitude, which was
+command: {v: 6} -> 'cov_xx' shows how uncertain a measurement is
+command: {v: {from: noisy, unit: ticks}} -> `unit: ticks/s`
+pose: {x: x, y: y, heading: deg} -> `heading_unit: deg`
+pose: {x: mm, y: mm, heading: yaw} -> `unit: mm`
+pose: {x: x, y: y, quaternion: [x, y, x, y]} -> order x, y, z, w
+pose: {x: x, y: y, quaternion: [qw, zero, zero, qz]} -> look like w, x, y, z
+"""
+
+
+@pytest.mark.parametrize("case", WRONG.strip().splitlines())
 def test_what_only_a_wrong_mapping_explains_is_refused_with_the_line_to_write(
-    log, columns, changes, fix
+    log, columns, case
 ):
+    changes, fix = case.split(" -> ")
     path = log(spoil(columns))
     with pytest.raises((ConfigError, RecordingError)) as refused:
         read(path, changes)
     assert fix in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("command: {v: {form: 1}}", "mean 'from'?"),
-        ("pose: {x: 1, y: 2}", "either heading or quaternion"),
-        ("pose: {x: 1, y: 2, heading: 3, unit: ms}", "one of m, dm"),
-        ("command: {v: {from: 1, unit: kmph}}", "mean 'mph'?"),
-        ("pose: {x: 1, y: 2, heading: 3, covariance: [1, 2]}", "3, 9 or 36"),
-        ("command:", "command: names none, but "),
-        ('command: {v: "/fix:longitude"}', "shows where the robot was, and was not"),
-    ],
-)
-def test_a_mapping_that_is_none_is_refused_with_file_and_key(tmp_path, text, sentence):
+NO_MAPPINGS = """
+command: {v: {form: 1}} -> mean 'from'?
+pose: {x: 1, y: 2} -> either heading or quaternion
+pose: {x: 1, y: 2, heading: 3, unit: ms} -> one of m, dm
+command: {v: {from: 1, unit: kmph}} -> mean 'mph'?
+pose: {x: 1, y: 2, heading: 3, covariance: [1, 2]} -> 3, 9 or 36
+command: -> command: names none, but
+command: {v: "/fix:longitude"} -> shows where the robot was, and was not
+"""
+
+
+@pytest.mark.parametrize("case", NO_MAPPINGS.strip().splitlines())
+def test_a_mapping_that_is_none_is_refused_with_file_and_key(tmp_path, case):
+    text, sentence = case.split(" -> ")
     given = {"pose": "/odom", "command": {"v": 1}} | parse_yaml(text, "changes")
     (tmp_path / "my.yaml").write_text(dump_yaml(given))
     with pytest.raises(ConfigError) as refused:
@@ -356,3 +350,19 @@ def test_a_unit_of_another_kind_than_the_command_s_is_refused(log, unit, says):
     with pytest.raises(ConfigError, match=says):
         open_drive(path, None, change_map(changes % unit))
     open_drive(path, None, change_map(changes % f"{unit}, scale: 0.5"))
+
+
+POSE = "pose: {x: odom_x, y: odom_y, heading: odom_yaw%s}\n"
+
+
+@pytest.mark.parametrize(
+    ("key", "measured_by"), [("", "odometry"), (", measured_by: tracker", "tracker")]
+)
+def test_a_second_heading_column_is_a_turn_rate(log, columns, key, measured_by):
+    odometry = {f"odom_{name}": columns[name] for name in ("x", "y", "yaw")}
+    second = {"second": np.degrees(columns["yaw"] * 30.0) % 360.0}
+    path = log(odometry | second)
+    changes = f"{POSE % key}imu: {{heading: {{from: second, unit: deg}}}}"
+    found = read(path, changes)
+    assert found.imu.values[:, 2] == pytest.approx(0.25 * 30.0, abs=1e-3)
+    assert found.measured_by == measured_by  # by the names, unless the mapping says it

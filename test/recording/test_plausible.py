@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -21,48 +19,41 @@ def pose(speed=0.6, turn=0.5):
     return np.column_stack([np.cumsum(step, axis=0), heading])
 
 
-def wrapped(values):
-    return (values + np.pi) % (2.0 * np.pi) - np.pi
-
-
-def test_a_drive_in_si_is_plausible_and_so_is_a_heading_that_turns_on():
-    assert find_implausible_pose(T, pose()) is None
-    assert find_implausible_pose(T, pose(2.0, 3.0)) is None
-    assert find_implausible_pose(T, pose(60.0, 0.2), radius=2.5) is None  # a race car
-
-
-@pytest.mark.parametrize("unwrapped", [True, False])
-def test_degrees_are_told(unwrapped):
-    values = pose()
-    values[:, 2] = np.degrees(values[:, 2] if unwrapped else wrapped(values[:, 2]))
-    assert find_implausible_pose(T, values).line == "heading_unit: deg"
-
-
-@pytest.mark.parametrize("turn", [0.05, 0.3])
-def test_degrees_of_a_slow_turn_are_told_by_the_path(turn):
+def turned(factor, wraps=False, turn=0.5):
+    """A drive whose headings are in another unit."""
     values = pose(turn=turn)
-    assert find_implausible_pose(T, values) is None
-    values[:, 2] = np.degrees(values[:, 2])
-    assert find_implausible_pose(T, values).line == "heading_unit: deg"
+    if wraps:
+        values[:, 2] = (values[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    return values * [1.0, 1.0, factor]
 
 
-@pytest.mark.parametrize("unwrapped", [True, False])
-def test_radians_that_are_taken_as_degrees_are_told(unwrapped):
-    values = pose()
-    values[:, 2] = np.radians(values[:, 2] if unwrapped else wrapped(values[:, 2]))
-    assert find_implausible_pose(T, values).line == "heading_unit: rad"
-
-
-def test_a_robot_that_spins_on_a_line_has_no_heading_in_degrees():
-    values = np.column_stack([np.sin(T), 0.2 * np.sin(T), 0.7 * T])
-    assert find_implausible_pose(T, values) is None
+DEG = 180.0 / np.pi
+SPINNING = np.column_stack([np.sin(T), 0.2 * np.sin(T), 0.7 * T])
 
 
 @pytest.mark.parametrize(
-    ("factor", "line"), [(100.0, "unit: cm"), (1000.0, "unit: mm")]
+    "values", [pose(), pose(2.0, 3.0), pose(turn=0.05), pose(turn=0.3), SPINNING]
 )
-def test_positions_that_are_no_metres_are_told(factor, line):
-    assert find_implausible_pose(T, pose() * [factor, factor, 1.0]).line == line
+def test_a_drive_in_si_is_plausible_and_so_is_a_heading_that_turns_on(values):
+    assert find_implausible_pose(T, values) is None
+
+
+def test_a_race_car_is_plausible():
+    assert find_implausible_pose(T, pose(60.0, 0.2), radius=2.5) is None
+
+
+@pytest.mark.parametrize(
+    ("values", "line"),
+    [
+        *((turned(DEG, wraps), "heading_unit: deg") for wraps in (False, True)),
+        *((turned(DEG, turn=turn), "heading_unit: deg") for turn in (0.05, 0.3)),
+        *((turned(1.0 / DEG, wraps), "heading_unit: rad") for wraps in (False, True)),
+        (pose() * [100.0, 100.0, 1.0], "unit: cm"),
+        (pose() * [1000.0, 1000.0, 1.0], "unit: mm"),
+    ],
+)
+def test_another_unit_is_told(values, line):
+    assert find_implausible_pose(T, values).line == line
 
 
 def test_milliseconds_are_told():
@@ -91,4 +82,4 @@ def test_the_heading_of_a_compass_is_told_with_what_turns_it_round(speed, turn):
 def test_a_straight_drive_or_a_robot_that_only_spins_does_not_show_a_compass():
     straight = pose(turn=0.02) * [1.0, 1.0, -1.0]
     assert line_of(straight) == ""
-    assert line_of(np.column_stack([np.sin(T), 0.2 * np.sin(T), 0.7 * T])) == ""
+    assert line_of(SPINNING) == ""

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 
 pytest.importorskip("rosbags", reason="needs the extra 'bags'")
@@ -343,3 +341,14 @@ def test_scans_are_as_late_after_their_last_beam_as_they_were(tmp_path, sweep):
 def test_stamps_of_another_clock_and_a_few_messages_tell_nothing(tmp_path, change):
     latency = measured(drive(tmp_path / "bag", **change))
     assert set(latency.measured) == {"odom"}
+
+
+@pytest.mark.parametrize("topic", ["/imu/data", "/gyroscope"])
+def test_any_topic_of_its_type_is_the_imu_of_a_bag(tmp_path, topic):
+    rows = bags.every(0.02, lambda t: bags.imu(t, 0.0, 0.0, 0.25))
+    topics = bags.drive()
+    topics["/odom"] = bags.along(bags.odometry)
+    topics.pop("/pose", None)
+    found = read(tmp_path, topics | {topic: rows}, CART)
+    assert found.imu is not None
+    assert found.measured_by == "odometry"

@@ -1,12 +1,9 @@
-from __future__ import annotations
-
 import re
 
 import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.names import split_words
 from nics_drl_bridge.recording.readers import explain_no_mapping, open_source
 from nics_drl_bridge.recording.survey import inspect_tables
 from nics_drl_bridge.recording.textbook import record
@@ -98,12 +95,6 @@ def test_gaps_backward_stamps_repeated_and_missing_rows_are_listed(tmp_path, col
         "stamps like the one before: 2, in rows that repeat all of it: 2",
     ):
         assert sentence in text
-
-
-def test_names_are_split_into_words():
-    names = ("Left_Tick", "cmdVel", "acc x (IMU)")
-    words = " ".join(word for name in names for word in split_words(name))
-    assert words == "left tick cmd vel acc x imu"
 
 
 def test_units_and_places_are_understood_from_names(tmp_path, columns):

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -7,7 +5,12 @@ import pytest
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording import topic_roles as kinds
-from nics_drl_bridge.recording.topic_roles import TopicRoles, assign, load_topic_roles
+from nics_drl_bridge.recording.topic_roles import (
+    TopicRoles,
+    assign,
+    guess_source_by_names,
+    load_topic_roles,
+)
 
 USUAL = {
     "/cmd_vel": kinds.TWIST,
@@ -177,3 +180,22 @@ def test_a_wrong_file_is_refused(tmp_path, text, sentence):
         load_topic_roles(file)
     assert sentence in str(caught.value)
     assert str(caught.value).startswith(str(file))
+
+
+@pytest.mark.parametrize(
+    ("names", "kind", "measured_by"),
+    [
+        (["/odom"], kinds.ODOMETRY, "odometry"),
+        (["/husky_velocity_controller/odom"], kinds.ODOMETRY, "odometry"),
+        (["/ground_truth"], kinds.ODOMETRY, "tracker"),
+        (["/vrpn/car/pose"], kinds.POSE, "tracker"),
+        (["/pose"], kinds.POSE, "tracker"),
+        (["/tf", "map"], kinds.TRANSFORMS, "tracker"),
+        (["/tf", "odom"], kinds.TRANSFORMS, "odometry"),
+        (["pfPoseData.csv", "x"], "", "tracker"),
+        (["vicon x"], "", "tracker"),
+        (["x(m)"], "", ""),
+    ],
+)
+def test_the_names_tell_what_measured_a_pose(names, kind, measured_by):
+    assert guess_source_by_names(names, kind) == measured_by

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -233,11 +231,7 @@ SCANS = [
         "beams go from",
     ),
     (
-        {
-            "angle_min": -180.0,
-            "angle_max": LIDAR.beams - 181.0,
-            "angle_increment": 1.0,
-        },
+        {"angle_min": -180.0, "angle_max": LIDAR.beams - 181.0, "angle_increment": 1.0},
         "unit",
         "degrees",
     ),

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 
@@ -47,7 +45,9 @@ def test_every_picture_of_a_fit_is_drawn(found, tmp_path):
 
 
 @slow
-def test_a_page_of_a_fit_begins_with_its_verdict_and_folds_all_figures(found, tmp_path):
+def test_a_page_of_a_fit_begins_with_its_verdict_and_folds_all_figures(
+    found, blank, tmp_path
+):
     spec, identified = found
     text = format_report("here", identified)
     write_fit_page(tmp_path / "report.html", "here", spec, identified, text)

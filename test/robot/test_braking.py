@@ -1,7 +1,5 @@
 """The bound on a robot's stops, beside stops that are simulated apart from it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from copy import deepcopy
 from math import comb
 
@@ -130,14 +128,6 @@ def test_every_product_stands_once_the_constant_first_by_order(variables, order)
     assert powers[-1].sum() == order
     shuffled = np.random.default_rng(2).permutation(powers)
     assert np.array_equal(sorted(shuffled, key=make_sort_key), powers)
-
-
-def test_the_features_are_the_distinct_entries_of_the_kronecker_product():
-    x = np.random.default_rng(0).normal(size=4)
-    with_one = np.concatenate([[1.0], x])
-    kronecker = np.unique(np.round(np.kron(with_one, with_one), 12))
-    ours = np.unique(np.round(evaluate(x, list_exponents(4, 2)), 12))
-    assert np.array_equal(ours, kronecker)
 
 
 def test_features_of_a_batch_are_products_of_powers():

@@ -1,7 +1,5 @@
 """A robot in a few words: its kind knows the rest, and a recording its ranges."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -128,10 +126,7 @@ def test_free_takes_whatever_was_recorded():
     robot = made(
         "free",
         {"pump": (0.0, 2.0), "valve": (-1.0, 1.0)},
-        command=[
-            {"name": "pump", "unit": "V"},
-            {"name": "valve"},
-        ],
+        command=[{"name": "pump", "unit": "V"}, {"name": "valve"}],
     )
     assert commands(robot) == [("pump", "V", 0.0, 2.0), ("valve", "1", -1.0, 1.0)]
 
