@@ -19,7 +19,7 @@ AllOption = Annotated[
     bool,
     typer.Option(
         "--all",
-        help="Compile those of the planners, the gate and the estimator too, as a robot needs.",
+        help="Compile those of planners, gate, estimator, training and identification too.",
     ),
 ]
 DemoOption = Annotated[
@@ -56,7 +56,7 @@ def warmup(
     if for_demo:
         parts += [_estimate, _learn, _guard]
     if all_kernels or for_wheel:
-        parts += [_estimate, _learn, _guard, _plan]
+        parts += [_estimate, _learn, _guard, _plan, _teach, _identify]
     with show_progress("compiling"):
         count, cpu_s = _compile(parts, for_wheel)
     took = time.monotonic() - begin
@@ -145,3 +145,30 @@ def _plan(model: Any) -> None:
     for name in ("dynamic_window", "mppi"):
         policy, task = open_policy(name, model)
         policy.act(task.observation(rehearse(model), {"goal": np.ones(2)}))
+
+
+def _teach(model: Any) -> None:
+    from nics_drl_bridge.env.teaching import Teaching
+    from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+
+    env = BridgeVectorEnv(2, model, "clutter", randomisation="strong")
+    env.teach(Teaching(path=1.0))
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    env.close()
+
+
+def _identify(_: Any) -> None:
+    from dataclasses import replace
+
+    import numpy as np
+
+    from nics_drl_bridge.identify.identify import identify
+    from nics_drl_bridge.recording import textbook
+    from nics_drl_bridge.robot.spec import load_robot
+
+    robot = load_robot(DEFAULT_ROBOT)
+    rng = np.random.default_rng(0)
+    drive = textbook.record(robot, rng, duration=4.0)
+    noisy = drive.pose.values + rng.normal(scale=1e-3, size=drive.pose.values.shape)
+    identify(replace(drive, pose=replace(drive.pose, values=noisy)), robot)

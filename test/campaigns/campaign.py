@@ -142,7 +142,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         quick=True,
     ),
     "gate_envelope": Campaign(
-        "--steps 3000",
+        "--steps 1200",
         {
             "no_limits": Control(
                 "the gate's limits: they are a hundred times as wide",
