@@ -209,7 +209,7 @@ CAMPAIGNS: dict[str, Campaign] = {
             ),
             "untested_rule": Control(
                 "the test of a rule: one is added that no test covers",
-                "rule stop/_covers_nothing",
+                "rule stop/covers_nothing",
             ),
         },
     ),
