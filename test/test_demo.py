@@ -105,7 +105,7 @@ def drive(tmp_path_factory):
     """Words for a short drive, of which a simulator is sooner generated than of the usual one."""
     robot = load_robot("differential")
     path = tmp_path_factory.mktemp("drive") / "drive.npz"
-    save_recording(textbook.record(robot, np.random.default_rng(1), 8.0), path)
+    save_recording(textbook.record(robot, np.random.default_rng(1), 20.0), path)
     return ("--robot", "differential", "--recording", path)
 
 

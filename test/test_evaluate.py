@@ -45,7 +45,7 @@ BASELINE = "evaluate dynamic_window --model differential --episodes 2 --out out"
 @pytest.mark.slow
 @needs_nodes
 def test_the_same_episodes_are_driven_by_other_physics_over_dds(tmp_path, domain_id):
-    done = nics(BASELINE, "--steps 40 --in fast --in mujoco_dds", cwd=tmp_path)
+    done = nics(BASELINE, "--in fast --in mujoco_dds", cwd=tmp_path)
     places = driven(done, tmp_path)["policies"]["dynamic_window"]
     for figures in places.values():
         assert [one["seed"] for one in figures["each"]] == [1_000_000, 1_000_001]
