@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import gc
 import os
 import re
 import signal
 from collections import defaultdict
+from collections.abc import Generator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -73,6 +75,16 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if match:
         marks |= set(re.findall(r"pytest\.mark\.(\w+)", match[1]))
     return True if marks & left_out(config) else None
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Keeps the garbage collector away from modules and tests, a million objects that stay."""
+    gc.disable()
+    collected = yield
+    gc.freeze()
+    gc.enable()
+    return collected
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -38,7 +38,7 @@ def names(folder: Path) -> set[str]:
 def drive(tmp_path_factory):
     path = tmp_path_factory.mktemp("drive") / "drive.npz"
     car = load_robot("ackermann")
-    save_recording(textbook.record(car, np.random.default_rng(0), duration=20.0), path)
+    save_recording(textbook.record(car, np.random.default_rng(0), duration=8.0), path)
     return path
 
 

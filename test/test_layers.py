@@ -86,8 +86,9 @@ def imports_of(path: Path, package: Path) -> set[str]:
             above = ".".join(here[: len(here) - node.level + 1]) if node.level else ""
             module = ".".join(part for part in (above, node.module) if part)
             found |= {f"{module}.{alias.name}" for alias in node.names}
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(
-            "import_module"
+        elif isinstance(node, ast.Call) and "import_module" in (
+            getattr(node.func, "id", ""),
+            getattr(node.func, "attr", ""),
         ):
             found |= {a.value for a in node.args if isinstance(a, ast.Constant)}
     return found

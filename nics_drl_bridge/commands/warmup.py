@@ -27,8 +27,7 @@ def warmup(
     """Compiles the simulator in advance, once per machine.
 
     Args:
-        all_kernels: Compile those of the planners, the gate and the estimator too, as a robot
-            needs.
+        all_kernels: Compile those of planners, gate, estimator, training and identification too.
         for_demo: Compile what nics demo needs: also training, estimator and gate.
         for_wheel: All for x86-64-v3, into the package's folder, for `make wheel`.
 
@@ -42,12 +41,15 @@ def warmup(
         os.environ |= {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""}
     typer.echo("compiling the kernels: a minute or two, once on this machine", err=True)
     parts: list[Callable[..., Any]] = [_step, _draw]
+    # These would compile what the others compile, so they come last.
+    last_parts: list[Callable[..., Any]] = [_simulate]
     if for_demo:
         parts += [_estimate, _learn, _guard]
     if all_kernels or for_wheel:
-        parts += [_estimate, _learn, _guard, _plan]
+        parts += [_estimate, _learn, _guard, _plan, _identify]
+        last_parts += [_teach]
     with show_progress("compiling"):
-        count, cpu_s = _compile(parts, for_wheel)
+        count, cpu_s = _compile([parts, last_parts], for_wheel)
     took = time.monotonic() - begin
     if as_json:
         typer.echo(format_json({"kernels": count, "cpu_s": cpu_s, "seconds": took}))
@@ -57,17 +59,18 @@ def warmup(
         )
 
 
-def _compile(parts: Sequence[Callable[..., Any]], for_wheel: bool) -> tuple[int, float]:
-    """Compiles parts at once; returns the number of kernels, and their CPU time [s]."""
+def _compile(
+    rounds: Sequence[Sequence[Callable[..., Any]]], for_wheel: bool
+) -> tuple[int, float]:
+    """Compiles the parts of a round at once; returns the number of kernels, and CPU time [s]."""
     # Spawned, not forked: a fork could inherit a lock that is never released.
-    workers = min(len(parts), WORKERS)
-    with get_context("spawn").Pool(workers, _begin, (for_wheel,)) as pool:
+    with get_context("spawn").Pool(WORKERS, _begin, (for_wheel,)) as pool:
         *first, model = pool.apply(_compile_by, (_model,))
-        jobs = [pool.apply_async(_compile_by, (part, model)) for part in parts]
-        others = [job.get()[:2] for job in jobs]
-        # It comes last, because it would compile what `_step` and `_draw` compile.
-        *last, _ = pool.apply(_compile_by, (_simulate, model))
-    counts, cpu_s = zip(first, *others, last, strict=True)
+        compiled = [first]
+        for parts in rounds:
+            jobs = [pool.apply_async(_compile_by, (part, model)) for part in parts]
+            compiled += [job.get()[:2] for job in jobs]
+    counts, cpu_s = zip(*compiled, strict=True)
     return sum(counts), sum(cpu_s)
 
 
@@ -152,3 +155,30 @@ def _plan(model: Any) -> None:
     for name in ("dynamic_window", "mppi"):
         policy, task = open_policy(name, model)
         policy.act(task.observation(rehearse(model), {"goal": np.ones(2)}))
+
+
+def _teach(model: Any) -> None:
+    from nics_drl_bridge.env.teaching import Teaching
+    from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+
+    env = BridgeVectorEnv(2, model, "clutter", randomisation="strong")
+    env.teach(Teaching(path=1.0))
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    env.close()
+
+
+def _identify(_: Any) -> None:
+    from dataclasses import replace
+
+    import numpy as np
+
+    from nics_drl_bridge.identify.identify import identify
+    from nics_drl_bridge.recording import textbook
+    from nics_drl_bridge.robot.spec import load_robot
+
+    robot = load_robot(DEFAULT_ROBOT)
+    rng = np.random.default_rng(0)
+    drive = textbook.record(robot, rng, duration=4.0)
+    noisy = drive.pose.values + rng.normal(scale=1e-3, size=drive.pose.values.shape)
+    identify(replace(drive, pose=replace(drive.pose, values=noisy)), robot)

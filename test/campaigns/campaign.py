@@ -142,7 +142,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         quick=True,
     ),
     "gate_envelope": Campaign(
-        "--steps 3000",
+        "--steps 1200",
         {
             "no_limits": Control(
                 "the gate's limits: they are a hundred times as wide",
@@ -209,7 +209,7 @@ CAMPAIGNS: dict[str, Campaign] = {
             ),
             "untested_rule": Control(
                 "the test of a rule: one is added that no test covers",
-                "rule stop/_covers_nothing",
+                "rule stop/covers_nothing",
             ),
         },
     ),

@@ -9,12 +9,20 @@ zero.
 
 from __future__ import annotations
 
+import os
 import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from campaign import Bars, Given, Result, at_least, at_most, run_campaign, tell
+from domains import claimed_domain
 from parts.processes import keep_busy
 
 from nics_drl_bridge.nodes.gate_faults import FAULTS, LATE_S, Setup, inject_all
@@ -50,33 +58,56 @@ def set_bars(result: Result) -> Bars:
     return bars
 
 
+def measure_fault(name: str, given: Given) -> dict[str, Any]:
+    """Injects a fault so often, around a gate of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        setup = Setup(ROBOT, ROBOT, Path(folder), TWIST)
+        setup = replace(setup, **CHANGES.get(given.control, {}))
+        found = list(inject_all(setup, name, range(given.repeats), tell))
+    tell(f"{name}: {len(found)} of {given.repeats}")
+    after_s = [injected.after_s for injected in found] or [np.nan]
+    times_s = [injected.time_s for injected in found] or [np.nan]
+    return {
+        "n": len(found),
+        "asked": given.repeats,
+        "p50_s": round(float(np.median(after_s)), 4),
+        "max_s": round(max(times_s), 4),
+        "limit_s": FAULTS[name].limit_s,
+        "unsafe_commands": sum(injected.unsafe for injected in found),
+    }
+
+
 def measure(given: Given) -> Result:
-    """Injects each fault so often; a gate of its own for each fault."""
-    result = {}
-    with keep_busy(given.load):
-        for name in given.fault or FAULTS:
-            with tempfile.TemporaryDirectory() as folder:
-                setup = Setup(ROBOT, ROBOT, Path(folder), TWIST)
-                setup = replace(setup, **CHANGES.get(given.control, {}))
-                found = list(inject_all(setup, name, range(given.repeats), tell))
-            tell(f"{name}: {len(found)} of {given.repeats}")
-            after_s = [injected.after_s for injected in found] or [np.nan]
-            times_s = [injected.time_s for injected in found] or [np.nan]
-            result[name] = {
-                "n": len(found),
-                "asked": given.repeats,
-                "p50_s": round(float(np.median(after_s)), 4),
-                "max_s": round(max(times_s), 4),
-                "limit_s": FAULTS[name].limit_s,
-                "unsafe_commands": sum(injected.unsafe for injected in found),
-            }
-    return result
+    """Injects each fault; most of the time passes while nodes start and gates are watched."""
+    names = given.fault or list(FAULTS)
+    about = partial(measure_fault, given=given)
+    with keep_busy(given.load), make_pool(given.at_once) as pool:
+        return dict(zip(names, pool.map(about, names), strict=True))
+
+
+@contextmanager
+def make_pool(at_once: int) -> Iterator[ProcessPoolExecutor]:
+    """Makes processes, each with a ROS domain of its own."""
+    spawn = get_context("spawn")
+    domains = spawn.Queue()
+    with ExitStack() as claimed:
+        for _ in range(at_once):
+            domains.put(claimed.enter_context(claimed_domain()))
+        yield claimed.enter_context(
+            ProcessPoolExecutor(at_once, spawn, enter_domain, (domains,))
+        )
+
+
+def enter_domain(domains: Any) -> None:
+    """Takes one of the domains, for all nodes that this process starts."""
+    os.environ["ROS_DOMAIN_ID"] = str(domains.get())
 
 
 OPTIONS = {
     "repeats": 30,
     "fault": {"action": "append", "choices": sorted(FAULTS), "help": "only this one"},
     "load": (0, "keep so many cores busy besides"),
+    "at-once": (1, "so many faults, each in processes of its own"),
 }
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -30,7 +31,6 @@ from nics_drl_bridge.nodes.processes import free_domain_id
 LIMIT_S = 1.0
 PATIENCE_S = 60.0
 READY_S = 280.0
-POLL_S = 0.01
 FIRST_LINE_S = 1.0  # until a node says that it starts, on cores that are not busy
 PHASES = {
     "starting": "]: starting",
@@ -79,45 +79,54 @@ start.start(sys.argv[3], sys.argv[3:])
 """
 
 
+def await_line(process: subprocess.Popen[bytes], words: str) -> None:
+    """Reads what a node says up to a line with some words. Raises RuntimeError if none comes."""
+    told = ""
+    late = threading.Timer(READY_S, process.kill)
+    late.start()
+    for line in process.stdout or ():
+        told += line.decode(errors="replace")
+        if words in told:
+            late.cancel()
+            return
+    raise RuntimeError(f"no line {words!r}:\n{told}")
+
+
 def end_node(
     node: str, phase: str, number: int, control: str, folder: Path
 ) -> dict[str, Any]:
-    """Ends a node once in a phase; returns times [s], and its code and log if it failed."""
-    log = folder / "log"
+    """Ends a node once in a phase; returns times [s], and its code and output if it failed."""
     environment = make_environment(free_domain_id())
     environment |= {"ROS_HOME": str(folder), "ROS_LOG_DIR": str(folder)}
     if phase in COLD:
         environment["NUMBA_CACHE_DIR"] = str(folder / "cache")
     words = ["--ros-args", *GIVEN.get(node, MODEL), "-r", f"__ns:=/{phase}_{number}"]
     begin_s = time.monotonic()
-    with log.open("wb") as file:
-        process = subprocess.Popen(
-            [sys.executable, "-c", START, control, phase, node, *words],
-            env=environment,
-            stdout=file,
-            stderr=file,
-            stdin=subprocess.DEVNULL,
-            cwd=folder,
-            start_new_session=True,
-        )
+    process = subprocess.Popen(
+        [sys.executable, "-c", START, control, phase, node, *words],
+        env=environment,
+        bufsize=0,  # so that nothing is read ahead of the line that is awaited
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        stdin=subprocess.DEVNULL,
+        cwd=folder,
+        start_new_session=True,
+    )
     try:
-        while PHASES[phase] not in log.read_text(errors="replace"):
-            if process.poll() is not None or time.monotonic() > begin_s + READY_S:
-                told = log.read_text(errors="replace")
-                raise RuntimeError(f"{node} was never {phase}:\n{told}")
-            time.sleep(POLL_S)
+        await_line(process, PHASES[phase])
         reached_s = time.monotonic() - begin_s
-        time.sleep(number % 10 / 10 * MOMENTS_S)
+        with suppress(subprocess.TimeoutExpired):
+            process.communicate(timeout=number % 10 / 10 * MOMENTS_S)
         begin_s = time.monotonic()
         process.send_signal((signal.SIGINT, signal.SIGTERM)[number % 2])
-        code: int | None = None
         with suppress(subprocess.TimeoutExpired):
-            code = process.wait(PATIENCE_S)
+            process.communicate(timeout=PATIENCE_S)
         took_s = time.monotonic() - begin_s
+        code = process.poll()
     finally:
         process.kill()
-        process.wait()
-    told = log.read_text(errors="replace")
+        output, _ = process.communicate()
+    told = output.decode(errors="replace")
     # Until a node runs, the signal may end it as by default.
     codes = (0,) if phase == "running" else (0, -signal.SIGINT, -signal.SIGTERM)
     is_clean = code in codes and "Traceback" not in told

@@ -48,6 +48,7 @@ SLOW_SKIP = 3
 GATE = ("reset", "arm")
 PATIENCE_S = 90.0
 STANDING_S = 5.0
+DRIVING = "driving"  # what the near end says on a whole network
 # Shared memory would go past the network.
 NETWORK = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
@@ -134,7 +135,7 @@ def run_robot(seconds: float, folder: Path, control: str) -> None:
     try:
         stands = control in ("standing", "slow_robot")
         drive_until(lambda: robot.moves, STANDING_S if stands else PATIENCE_S)
-        (folder / "driving").touch()
+        print(DRIVING, flush=True)
         sent = robot.sent["scan"]
         drive_until(lambda: False, seconds)
         offset_s = time.time() - time.monotonic()
@@ -176,11 +177,18 @@ def measure_loss(
             call = f"run_{part}({seconds}, packet_loss.Path({name!r}), {control!r})"
             code = f"import packet_loss; packet_loss.{call}"
             words = cable.command(end, [sys.executable, "-c", code])
-            parts.append(subprocess.Popen(words, env=environment, cwd=FOLDER))
+            parts.append(
+                subprocess.Popen(
+                    words,
+                    env=environment,
+                    cwd=FOLDER,
+                    text=True,
+                    stdout=subprocess.PIPE if part == "robot" else None,
+                )
+            )
         try:
-            deadline = time.monotonic() + PATIENCE_S
-            while not (folder / "driving").exists() and time.monotonic() < deadline:
-                time.sleep(0.05)
+            while DRIVING not in (parts[0].stdout.readline() or DRIVING):
+                pass
             since = time.time()
             cable.lose(0 if control == "no_loss" else percent)
             parts[0].wait(PATIENCE_S + seconds)

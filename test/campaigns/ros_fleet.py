@@ -9,6 +9,7 @@ one after the other, until one is not held.
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 import time
@@ -105,11 +106,14 @@ def command(robots: int) -> None:
         for k in range(robots)
     ]
     message = wire.write_twist(np.array(COMMAND))
-    parent = os.getppid()
-    while os.getppid() == parent:
+
+    def publish() -> None:
         for topic in topics:
             topic.publish(message)
-        time.sleep(1.0 / COMMAND_HZ)
+
+    commander.node.create_timer(1.0 / COMMAND_HZ, publish)
+    parent = os.getppid()
+    commander.until(lambda: os.getppid() != parent, math.inf)
 
 
 def write_world(file: Path, robots: int) -> None:

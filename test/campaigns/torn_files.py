@@ -10,10 +10,11 @@ import os
 import shutil
 import signal
 import tempfile
-import time
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from mmap import mmap
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ LEAST_DURING = 0.25  # fraction of the kills that have to hit a write
 PIECE = 4096  # bytes that a naive writer writes at once, as a buffered file does
 # Shared with the writer: numbers of writes that began, and that ended, modulo 256.
 WRITES = mmap(-1, 2)
+BEGUN = get_context("fork").Semaphore(0)  # one for each write that began
 
 
 def count_torn(
@@ -45,15 +47,17 @@ def count_torn(
     during = 0
     for _ in range(kills):
         WRITES[:] = bytes(2)
+        while BEGUN.acquire(block=False):  # writes of the last one
+            pass
         child = os.fork()
         if child == 0:
             _write_for_ever(loader, path)
-        latest_s = time.monotonic() + STARTS_S
-        while WRITES[0] == 0 and time.monotonic() < latest_s:
-            time.sleep(0.0)
-        time.sleep(rng.uniform(0.0, LONGEST_S))
-        os.kill(child, signal.SIGKILL)
+        BEGUN.acquire(timeout=STARTS_S)
+        moment_s = rng.uniform(0.0, LONGEST_S)
+        killer = threading.Timer(moment_s, os.kill, (child, signal.SIGKILL))
+        killer.start()
         os.waitpid(child, 0)
+        killer.join()
         during += WRITES[0] != WRITES[1]
         try:
             is_whole = loader.read(path) in versions
@@ -91,6 +95,7 @@ def _write_for_ever(loader: Loader, path: Path) -> None:
 def _note_begin(make: Callable[..., Any]) -> Callable[..., Any]:
     def make_and_note(*given: Any, **named: Any) -> Any:
         WRITES[0] = (WRITES[0] + 1) % 256
+        BEGUN.release()
         return make(*given, **named)
 
     return make_and_note

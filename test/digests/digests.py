@@ -148,7 +148,7 @@ def motion_state_terms() -> Found:
     from nics_drl_bridge.robot.spec import build_robot
 
     robot = FOREIGN["skid_steer"]
-    recording = foreign_drive(robot, 11, 20.0).recording()
+    recording = foreign_drive(robot, 11, 8.0).recording()
     spec = build_robot(robot.robot, robot.commands)
     terms = identify(recording, spec, alpha=0.99).model.named.terms
     return {rate: sorted(row) for rate, row in terms.items()}

@@ -58,7 +58,7 @@ def wide(proto):
 
 def crowded(proto):
     """Operators that are nothing but two bytes each."""
-    nodes = b"\x0a\x00" * 3_000_000
+    nodes = b"\x0a\x00" * 1_000_000
     return proto.SerializeToString() + field(7, nodes)
 
 
