@@ -38,8 +38,6 @@ SMOOTHING_BURSTS = 1.5
 UNIFORM = 1e-6
 WHOLE = 1e-6  # tolerance within which a period counts as a whole number of steps
 SAME_STEP = 1e-3  # fraction of a step by which rounding of stamps may change it
-# minimum fraction of rows with common stamps for which the other rows are dropped
-SHARED = 0.5
 # rates are unknown between states further apart than this many median steps
 STATE_GAP = 2.5
 
@@ -113,16 +111,15 @@ class Calibration:
         return geometry.compose(base, self.mounting)
 
 
+def name_sum(state: str) -> str:
+    """Returns the name of the uncertainty of a latency and a lag together."""
+    return f"command_latency_and_{state}_lag_s"
+
+
 def align(drive: Drive, calibration: Calibration) -> Samples:
     """Resamples a drive on one time axis, at `base_link`; RecordingError without an overlap."""
-    # An exact drive is used bit for bit; noisy poses are smoothed by local parabolas.
-    recording = drive.recording
     period = drive.settings.control_period_s
-    shared = _find_shared_stamps(recording, period) if calibration.is_exact else None
-    if shared is not None:
-        samples = samples_on_one_clock(*shared)
-        return replace(samples, dt=find_dividing_step(period, samples.dt))
-    grid, step = _make_grid(recording, calibration, period)
+    grid, step = _make_grid(drive.recording, calibration, period)
     half_width = SMOOTHING_BURSTS * calibration.burst_period_s
     if not half_width and (
         calibration.position_noise_m or calibration.heading_noise_rad
@@ -200,65 +197,27 @@ def resample_states(drive: Drive, calibration: Calibration, grid: Array) -> Arra
     return np.asarray(gains * inferred[lead:])
 
 
-def _find_shared_stamps(
-    recording: Recording, period: float
-) -> tuple[Array, Array, Array, Array] | None:
-    """Returns stamps (T,), poses, states, commands of rows on a grid that divides a period."""
-    pose = recording.pose
-    state = recording.state
-    command = recording.command
-    if state is None:
-        return None
-    usual = float(np.median(np.diff(pose.t)))
-    if not usual > 0.0:
-        return None
-    step = find_dividing_step(period, usual)
-    if abs(step - usual) > SAME_STEP * usual:
-        return None
-    times = [stream.t - pose.t[0] for stream in (pose, state, command)]
-    ticks = [np.round(t / step) for t in times]
-    off = [np.abs(t - n * step).max() for t, n in zip(times, ticks, strict=True)]
-    if max(off) > UNIFORM * max(1.0, float(pose.t[-1] - pose.t[0])):
-        return None
-    by_pose, by_state, by_command = _find_shared_rows(ticks)
-    if len(by_pose) < SHARED * max(map(len, ticks)):
-        return None
-    return (
-        pose.t[by_pose],
-        pose.values[by_pose],
-        state.values[by_state],
-        command.values[by_command],
-    )
-
-
-def _find_shared_rows(ticks: list[Array]) -> tuple[NDArray[np.intp], ...]:
-    """Returns the rows of three streams whose ticks (T,) are in all of them."""
-    pose, state, command = ticks
-    shared, first, second = np.intersect1d(pose, state, return_indices=True)
-    _, both, third = np.intersect1d(shared, command, return_indices=True)
-    return first[both], second[both], third
-
-
 def _make_grid(
     recording: Recording, calibration: Calibration, period: float
 ) -> tuple[Array, float]:
-    """Returns uniform times (T,) covered by pose, commands and state, on the commands' clock.
+    """Returns times (T,) covered by pose, commands and state, on the commands' clock.
 
-    Also returns their step [s], which divides a period [s].
+    Also returns their step [s], which divides a period [s]. An exact drive keeps its own times.
     """
     pose = recording.pose.t + calibration.clock_offset_s
-    step = float(np.median(np.diff(pose)))
-    if (
-        calibration.burst_period_s > 0.0
-        or not STEP_RANGE_S[0] <= step <= STEP_RANGE_S[1]
-    ):
-        step = STEP_S
-    step = find_dividing_step(period, step)
+    usual = float(np.median(np.diff(pose)))
+    step = find_dividing_step(period, usual)
+    is_kept = calibration.is_exact and abs(step - usual) < SAME_STEP * usual
+    is_usable = STEP_RANGE_S[0] <= usual <= STEP_RANGE_S[1]
+    if not is_kept and (calibration.burst_period_s > 0.0 or not is_usable):
+        step = find_dividing_step(period, STEP_S)
     first = max(pose[0], recording.command.t[0] + calibration.command_latency_s)
     last = pose[-1]
     if recording.state is not None:
         first = max(first, recording.state.t[0])
         last = min(last, recording.state.t[-1])
+    if is_kept:
+        return pose[(pose > first - UNIFORM) & (pose < last + UNIFORM)], step
     count = int(np.floor((last - first) / step + 1e-6))
     if count < MIN_STAMPS:
         fault = f"commands and poses overlap for only {max(last - first, 0.0):.2f} s"
@@ -277,10 +236,6 @@ def select_outside_gaps(
     return np.asarray(gap < max(least, usual * float(np.median(np.diff(samples)))))
 
 
-WIDTHS_S = (0.07, 0.1, 0.15, 0.2)  # half-widths of the parabolas that give the twist
-# fraction of the usual speed, and turn rate, that the noise of a twist may reach
-NOISE = 0.02
-SAMPLES = 2.5  # minimum number of samples in half a width
 # steps of models, by the step of the poses
 FINE_S = 0.01
 COARSE_S = 0.02
@@ -292,24 +247,6 @@ def has_motion_as_state(spec: RobotSpec, recording: Recording) -> bool:
     if recording.state is not None:
         return False
     return any(v.twist for v in spec.state) or not (spec.state or spec.takes_cmd_vel)
-
-
-def choose_half_width(drive: Drive) -> float:
-    """Returns the half-width [s] for smoothing poses: the shortest that reduces noise enough."""
-    t = drive.dated.t
-    pose = unwrap_headings(drive.dated.values)
-    span = float(t[-1] - t[0])
-    every = span / max(len(t) - 1, 1)
-    speed = np.hypot(*np.diff(pose[:, :2], axis=0).T).sum() / span
-    turn = np.abs(np.diff(pose[:, 2])).sum() / span
-    position, heading = drive.pose_noise or (0.0, 0.0)
-    for width in WIDTHS_S:
-        gain = np.sqrt(12.0 * every / (2.0 * width)) / (2.0 * width)
-        if gain * position <= NOISE * speed and gain * heading <= NOISE * max(
-            turn, speed
-        ):
-            break
-    return float(max(width, SAMPLES * every))
 
 
 def add_motion(
@@ -348,13 +285,6 @@ def measure_body_twists(
     rates = find_slopes(pose, rows, step)
     forward = geometry.rotate(rates[:, :2], -pose[:, 2])
     return np.concatenate([forward, rates[:, 2:]], axis=1)
-
-
-def smooth_commands(command: Array, step: float, width: float) -> Array:
-    """Returns commands (T, C) at uniform times, smoothed like a twist derived by parabolas."""
-    sums = np.cumsum(command, axis=0) * step
-    rows = 2 * max(2, round(width / step)) + 1
-    return find_slopes(sums, rows, step)
 
 
 def find_slopes(values: Array, rows: int, step: float) -> Array:

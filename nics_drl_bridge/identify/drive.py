@@ -1,6 +1,5 @@
 """Drive: a recording of a robot, with cached quantities that several stages derive from it."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -30,7 +29,10 @@ LEAST_WHOLE = 0.1
 NEGLIGIBLE = 1e-6  # m, rad
 REST_SAMPLES = 12
 REST_DRIFT = 3.0  # standard errors at rest; straight motion shows at least 4
-SLOPE_NOISE = 0.05
+WIDTHS_S = (0.07, 0.1, 0.15, 0.2)  # half-widths of the parabolas that give the twist
+# fraction of the usual speed, and turn rate, that the noise of a twist may reach
+NOISE = 0.02
+SAMPLES = 2.5  # minimum number of samples in half a width
 MAX_SPAN_S = 0.2
 MAX_GAP_S = 0.25
 
@@ -68,17 +70,6 @@ class Drive:
         same = replace(self, settings=settings)
         vars(same).update(vars(self) | {"settings": settings})
         return same
-
-    def folds(self, count: int) -> "Iterator[tuple[Drive, Drive]]":
-        """Yields the drive without the poses of a block, and with these alone, block by block."""
-        pose = self.recording.pose
-        for block in np.array_split(np.arange(len(pose.t)), count):
-            others = np.ones(len(pose.t), dtype=np.bool_)
-            others[block] = False
-            yield (
-                self.part(replace(self.recording, pose=pose.rows(others))),
-                self.part(replace(self.recording, pose=pose.rows(block))),
-            )
 
     @property
     def duration_s(self) -> float:
@@ -123,8 +114,12 @@ class Drive:
             stride = 1
             longest = 1.8 * self.bursts.period_s
         else:
-            stride = self._find_stride()
+            stride = 1
             longest = MAX_GAP_S
+            if any(self.pose_noise or ()):
+                dt = float(np.median(np.diff(self.dated.t)))
+                span_s = min(2.0 * self.half_width_s, MAX_SPAN_S)
+                stride = max(1, round(span_s / dt))
         t = self.dated.t[::stride]
         pose = self.dated.values[::stride]
         span = np.diff(t)
@@ -133,24 +128,22 @@ class Drive:
         twist = moved / span[usable, None]
         return TwistIntervals(t[:-1][usable], t[1:][usable], twist)
 
-    def _find_stride(self) -> int:
-        """Returns the number of steps of the pose over which motion stands out from its noise."""
+    @cached_property
+    def half_width_s(self) -> float:
+        """Half-width for smoothing poses [s]: the shortest that reduces their noise enough."""
         t = self.dated.t
-        pose = self.dated.values
-        dt = float(np.median(np.diff(t)))
-        longest = max(1, round(MAX_SPAN_S / dt))
-        moved = geometry.between(pose[:-longest:longest], pose[longest::longest])
-        twist = geometry.log(moved) / (longest * dt)
-        if not len(twist):
-            twist = np.zeros((1, 3))
-        speed = float(np.sqrt((twist[:, :2] ** 2).sum(axis=1).mean()))
-        turn = float(np.sqrt((twist[:, 2] ** 2).mean()))
-        position_noise, heading_noise = self.pose_noise or (0.0, 0.0)
-        needed_s = np.sqrt(2.0) * max(
-            position_noise / max(SLOPE_NOISE * speed, 1e-9),
-            heading_noise / max(SLOPE_NOISE * turn, 1e-9),
-        )
-        return int(np.clip(np.ceil(needed_s / dt), 1, longest))
+        pose = unwrap_headings(self.dated.values)
+        span = float(t[-1] - t[0])
+        every = span / max(len(t) - 1, 1)
+        speed = np.hypot(*np.diff(pose[:, :2], axis=0).T).sum() / span
+        turn = np.abs(np.diff(pose[:, 2])).sum() / span
+        position, heading = self.pose_noise or (0.0, 0.0)
+        for width in WIDTHS_S:
+            gain = np.sqrt(12.0 * every / (2.0 * width)) / (2.0 * width)
+            is_calm = gain * heading <= NOISE * max(turn, speed)
+            if is_calm and gain * position <= NOISE * speed:
+                break
+        return float(max(width, SAMPLES * every))
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import numpy as np
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.calibration import Calibration, name_sum
 from nics_drl_bridge.identify.clocks import TimingEstimate
-from nics_drl_bridge.identify.drive import MAX_GAP_S, Drive
+from nics_drl_bridge.identify.drive import MAX_GAP_S, Drive, Settings
 from nics_drl_bridge.identify.findings import (
     Findings,
     require_fit,
@@ -61,6 +61,12 @@ SPACING_OF_RECORDING_S = 0.5
 # ratio to the errors of the other recordings from which one is reported as off
 ALONE = 2.5
 LEAST_SHARE = 0.02  # fraction of the path below which errors are ignored
+
+
+TOO_SHORT = (
+    "The training part is too short to refine the model by its errors over seconds; record a "
+    "longer drive."
+)
 
 
 class Gap(str):
@@ -273,11 +279,6 @@ def _describe_wheels(calibration: Calibration) -> Iterator[str]:
     if calibration.wheels_swapped:
         why = "is the faster one when the robot turns left, and the slower one when it turns right"
         yield f"Left and right wheel look interchanged: the wheel recorded as the left one {why}."
-
-
-def name_sum(state: str) -> str:
-    """Returns the name of the uncertainty of a latency and a lag together."""
-    return f"command_latency_and_{state}_lag_s"
 
 
 def describe_sums(calibration: Calibration) -> Iterator[str]:
@@ -531,6 +532,27 @@ def describe_replacement(lost: HorizonErrors) -> str:
     written = "the model written is the textbook, fitted to the training part"
     bias = "since these data chose it, its errors on them are slightly optimistic"
     return f"{finding}: {written}; {bias}."
+
+
+def describe_refinement(horizon_s: float) -> str:
+    """States the longest horizon of the predictions [s]; 0 if none fitted into the drive."""
+    if horizon_s == 0.0:
+        return TOO_SHORT
+    by = f"the open-loop errors over up to {horizon_s:g} s"
+    return f"Coefficients and calibration were refined by {by}."
+
+
+def list_unused_options(
+    settings: Settings, is_motion: bool, has_order: bool
+) -> Iterator[str]:
+    """Yields a sentence per option that had no effect on a model found by predictions."""
+    if settings.alpha != "auto" and is_motion:
+        why = "where the state is the motion, or there is none, predictions weight the terms"
+        yield f"alpha = {settings.alpha:g} was not used: {why}."
+    if settings.order != "auto" and not has_order:
+        off = f"more than {WORSE:g} times as far off as the textbook's, or diverge"
+        why = f"predictions with its terms are {off}, so only the textbook's were kept"
+        yield f"order = {settings.order} was not used: {why}."
 
 
 def describe_refit(until: float, duration: float, worse: bool) -> str:

@@ -10,19 +10,16 @@ from scipy.signal import savgol_filter
 
 from identify.drives import fit_trial, slipping_car
 from nics_drl_bridge.identify.calibration import (
-    WIDTHS_S,
     Calibration,
     add_motion,
-    choose_half_width,
     find_slopes,
     has_motion_as_state,
     make_motion_grid,
     make_surrogate,
     require_state,
     resample_motion,
-    smooth_commands,
 )
-from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.drive import WIDTHS_S, Drive
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import build_robot, load_robot
@@ -53,15 +50,13 @@ def test_a_twist_that_was_not_measured_is_taken_from_the_pose(drive, car):
 
 
 def test_noisier_poses_are_smoothed_over_longer(drive):
-    assert choose_half_width(drive) == WIDTHS_S[0]
+    assert drive.half_width_s == WIDTHS_S[0]
     noise = np.random.default_rng(0).normal(
         0.0, 0.01, drive.recording.pose.values.shape
     )
     pose = replace(drive.recording.pose, values=drive.recording.pose.values + noise)
-    assert (
-        choose_half_width(Drive(replace(drive.recording, pose=pose), drive.spec))
-        > WIDTHS_S[0]
-    )
+    noisier = Drive(replace(drive.recording, pose=pose), drive.spec)
+    assert noisier.half_width_s > WIDTHS_S[0]
 
 
 @pytest.mark.parametrize(
@@ -119,16 +114,6 @@ def test_poses_that_are_known_to_be_doubtful_do_not_bend_the_motion(drive):
         found = require_state(add_motion(seen, MOUNTED, grid, 0.07)).values
         off.append(np.abs(found - truth).mean())
     assert off[1] < 0.1 * off[0]
-
-
-def test_commands_are_as_smooth_as_the_twist_so_that_they_begin_and_end_together():
-    step = 0.02
-    width = 0.25
-    speed = np.where(np.arange(400) * step < 4.0, 0.2, 0.6)[:, None]
-    smooth = smooth_commands(speed, step, width)[:, 0]
-    changed = np.flatnonzero((smooth > 0.201) & (smooth < 0.599)) * step
-    assert changed[[0, -1]] == pytest.approx([4.0 - width, 4.0 + width], abs=0.05)
-    assert smooth[100:-100].mean() == pytest.approx(0.4, abs=0.01)
 
 
 @pytest.mark.slow
