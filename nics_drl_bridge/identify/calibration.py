@@ -116,31 +116,26 @@ def name_sum(state: str) -> str:
     return f"command_latency_and_{state}_lag_s"
 
 
-def align(drive: Drive, calibration: Calibration) -> Samples:
-    """Resamples a drive on one time axis, at `base_link`; RecordingError without an overlap."""
-    period = drive.settings.control_period_s
-    grid, step = _make_grid(drive.recording, calibration, period)
-    half_width = SMOOTHING_BURSTS * calibration.burst_period_s
-    if not half_width and (
-        calibration.position_noise_m or calibration.heading_noise_rad
-    ):
-        half_width = SMOOTHING_S
-    return resample_drive(drive, calibration, grid, step, half_width)
-
-
-def resample_drive(
-    drive: Drive, calibration: Calibration, grid: Array, step: float, half_width: float
+def align(
+    drive: Drive, calibration: Calibration, motion_width_s: float | None = None
 ) -> Samples:
-    """Resamples a drive at times (T,) on the commands' clock, without its gaps.
+    """Resamples a drive on one time axis, at `base_link`, without its gaps.
 
-    Args:
-        drive: the drive.
-        calibration: of the drive.
-        grid: (T,) times, a whole number of steps apart [s].
-        step: [s].
-        half_width: of the parabolas that smooth the poses [s]; 0 for none.
+    A drive from `add_motion` keeps the times of its state, and has poses smoothed as wide as that
+    was derived [s]. Raises RecordingError without an overlap.
     """
     recording = drive.recording
+    if motion_width_s is not None:
+        grid = require_state(drive).t
+        step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
+        half_width = 0.5 * motion_width_s
+    else:
+        period = drive.settings.control_period_s
+        grid, step = _make_grid(recording, calibration, period)
+        half_width = SMOOTHING_BURSTS * calibration.burst_period_s
+        is_noisy = calibration.position_noise_m or calibration.heading_noise_rad
+        if not half_width and is_noisy:
+            half_width = SMOOTHING_S
     begin = grid - calibration.command_latency_s
     samples = samples_on_one_clock(
         grid,
@@ -315,13 +310,6 @@ def _infer_follower(
     latency = calibration.command_latency_s
     command = drive.recording.command
     return infer_states(command, alone, np.array(lag), latency, t)[:, 0]
-
-
-def resample_motion(drive: Drive, calibration: Calibration, width: float) -> Samples:
-    """Resamples a drive from `add_motion` at the times of its state, with poses smoothed alike."""
-    grid = require_state(drive).t
-    step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
-    return resample_drive(drive, calibration, grid, step, 0.5 * width)
 
 
 def require_state(drive: Drive) -> Stream:

@@ -49,6 +49,10 @@ WORTH = 0.03  # minimum fraction of the residual variance that a curve must expl
 CLEAR = 0.25
 STRIDE_S = 0.04
 NOTHING = 1e-6  # [m/s, rad/s]
+ENOUGH_ROWS = 1000  # to rank delays
+# order of the model in the search for a delay
+DELAY_ORDER = 2
+DELAY_STEP_S = 0.02
 LONGEST_S = 0.4  # a delay is sought this far around where its search starts
 # step of their refinement
 DELAY_SCALE_S = 0.05
@@ -609,3 +613,27 @@ def _drop_limits(
         if not highest > limits[i, 1] > errors.get(f"{name}.rise", 0.0):
             limits[i, 1] = np.inf
     return limits
+
+
+def find_likely_latency(evidence: Evidence) -> float:
+    """Returns the latency of commands [s] by which least squares best explains a motion."""
+    drive = evidence.drive
+    spec = drive.spec
+    recording = drive.recording
+    trials = np.arange(0.0, LONGEST_S, DELAY_STEP_S)
+    if recording.pose.clock != recording.command.clock:
+        trials = trials - LONGEST_S / 2.0
+    dt = evidence.samples.dt
+    count = len(evidence.samples.t)
+    stride = max(1, min(round(STRIDE_S / dt), count // ENOUGH_ROWS))
+    samples = evidence.samples.rows(np.arange(count) % stride == 0)
+    state = samples.x[:, : len(spec.state)]
+    free = [3 + i for i, v in enumerate(spec.state) if v.twist] or [0, 2]
+    left = []
+    for latency in trials:
+        begin = samples.t - latency
+        inputs = evidence.calibration.inputs
+        command = average_effect(recording.command, spec, inputs, begin, begin + dt)
+        told = replace(samples, x=np.concatenate([state, command], axis=1))
+        left.append((1.0 - evidence.library.fit(told, DELAY_ORDER).r2[free]).sum())
+    return float(trials[int(np.argmin(left))])

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from nics_drl_bridge.identify import clocks, selection
-from nics_drl_bridge.identify.calibration import Calibration, align, resample_motion
+from nics_drl_bridge.identify.calibration import Calibration, align
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import Fit, Regression
 from nics_drl_bridge.identify.mounting import Mounting
@@ -120,6 +120,4 @@ def require_model(findings: Findings) -> TaylorModel:
 
 def resample_drive(drive: Drive, findings: Findings) -> Samples:
     """Resamples a part of the drive on one time axis, by the calibration found so far."""
-    if findings.motion_width_s is None:
-        return align(drive, findings.calibration)
-    return resample_motion(drive, findings.calibration, findings.motion_width_s)
+    return align(drive, findings.calibration, findings.motion_width_s)

@@ -38,6 +38,7 @@ from nics_drl_bridge.identify.effects import (
     drop_unreached_ends,
     find_input_curve,
     find_latency,
+    find_likely_latency,
     make_curves,
 )
 from nics_drl_bridge.identify.findings import (
@@ -377,22 +378,37 @@ def derive_motion(drive: Drive, findings: Findings) -> Findings:
 
 
 def find_input_curves(drive: Drive, findings: Findings) -> Findings:
-    """Finds the dead zones and saturation of commands that explain a motion."""
+    """Finds the latency, and the dead zones and saturation of commands, that explain a motion."""
     if findings.motion_width_s is None:
         return findings
+    findings = _with_likely_latency(drive, findings)
     samples = resample_drive(findings.training, findings)
     found = [
         find_input_curve(samples, drive.spec, place)
         for place in range(len(drive.spec.command))
     ]
     curves = [candidate for candidate in found if candidate is not None]
-    return replace(
+    if not curves:
+        return findings
+    inputs = tuple(found.curve for found in curves)
+    findings = replace(
         findings,
-        calibration=replace(
-            findings.calibration, inputs=tuple(found.curve for found in curves)
-        ),
+        calibration=replace(findings.calibration, inputs=inputs),
         clear_curves=tuple(found.curve for found in curves if found.gain >= CLEAR),
     )
+    return _with_likely_latency(drive, findings)  # the curves may hide a part of it
+
+
+def _with_likely_latency(drive: Drive, findings: Findings) -> Findings:
+    """Returns findings with the latency of commands that best explains a motion, if one does."""
+    training = findings.training
+    calibration = findings.calibration
+    samples = resample_drive(training, findings)
+    library = make_library(drive, findings)
+    with suppress(FitError):
+        latency = find_likely_latency(Evidence(training, calibration, samples, library))
+        calibration = replace(calibration, command_latency_s=latency)
+    return replace(findings, calibration=calibration)
 
 
 def fit_terms(drive: Drive, findings: Findings) -> Findings:
@@ -585,7 +601,11 @@ def judge_model(drive: Drive, findings: Findings) -> Findings:
     unseen: Samples | None = samples.rows(samples.t > held_out_from)
     if unseen is not None and len(unseen.t) < verdict.MIN_ROWS:
         unseen = None
-    held_out = verdict.try_model(model, calibration, whole, until)
+    held_out = None
+    with suppress(RecordingError):  # the rest is too short
+        held_out = open_loop.measure_open_loop_error(
+            model, calibration, whole, until, whole.duration_s
+        )
     yardstick = findings.yardstick or fit_textbook(whole, calibration)
     bands = _find_bands(drive, findings)
     judgement = judge_predictions(model, calibration, whole, bands, yardstick)

@@ -185,12 +185,6 @@ def _describe_errors(name: str, at: HorizonErrors, errors: EndErrors) -> str:
     return f"{finding}, those of {name} {errors.position_m:.3g} m"
 
 
-def compute_relative_error(at: HorizonErrors, radius: float) -> float:
-    """Returns an error as a fraction of the path, or of the robot's radius [m] if longer."""
-    # A robot that turns in place has no path.
-    return at.model.position_m / max(at.path_m, radius, 1e-9)
-
-
 def rate(
     judgement: tuple[HorizonErrors, ...], radius: float, textbook: bool
 ) -> Assessment:
@@ -232,7 +226,8 @@ def rate_unseen(gap_s: float, duration_s: float) -> Assessment:
 def _list_faults(at: HorizonErrors, radius: float) -> Iterator[tuple[Verdict, str]]:
     """Yields a verdict and a reason for each threshold of a good model that this one misses."""
     limits = THRESHOLDS
-    share = compute_relative_error(at, radius)
+    # A robot that turns in place has no path.
+    share = at.model.position_m / max(at.path_m, radius, 1e-9)
     far = f"After {at.horizon_s:g} s its predictions of unseen data end {share:.1%} of their path"
     if not np.isfinite(share):
         yield Verdict.DO_NOT_TRAIN, "Its predictions diverge."

@@ -43,6 +43,7 @@ NOTHING = 1e-4  # m, rad: size below which a removed part of a mounting counts a
 # A model uses the values at the start of a step, so a time is uncertain by the standard deviation
 # of a uniform distribution over the step.
 WITHIN_STEP = 12.0**-0.5
+NO_ERROR = 1e-9
 # ratio of the error of a pull to that of a stronger one, from which no weaker one is tried
 HOPELESS = 1.02
 LONGEST_LAG_S = 2.0  # a state that takes longer is coasting, so it hides no latency
@@ -184,11 +185,15 @@ class Draft:
         return calibration
 
     def _widen_errors(self, found: shooting.Predictive) -> dict[str, float]:
-        """Returns the errors of the parameters of commands and states; a step widens delays."""
+        """Returns the errors of the parameters of commands and states; a step widens delays.
+
+        Parameters that do not affect the predictions are left out.
+        """
         within_step = WITHIN_STEP * self.problem.samples.dt
         return {
             name: float(np.hypot(e, within_step)) if name.endswith(".delay") else e
-            for name, e in found.shown_errors.items()
+            for name, e in found.errors.items()
+            if "." in name and e > NO_ERROR
         }
 
     def _calibrate_time(
@@ -539,7 +544,7 @@ def _is_certain(changed: shooting.Predictive, before: shooting.Predictive) -> bo
 def list_candidates(
     base: Base | None, trials: Sequence[Trial], order: Order = "auto"
 ) -> Iterator[Candidate]:
-    """Yields all candidates that were tried: forms of the textbook, then orders of terms."""
+    """Yields all candidates that were tried: effects beside the textbook, then orders of terms."""
     if base is not None:
         yield from base.candidates
     if not trials:

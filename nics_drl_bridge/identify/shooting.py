@@ -56,7 +56,6 @@ EVALUATIONS = 60
 # minimum distance of a start value from its bounds, as a fraction of its range
 INSIDE = 0.05
 LEAST_SCALE = 0.02  # scale of the loss, below which errors count by their squares [m/s]
-NO_ERROR = 1e-9
 STEEPEST = 1e6  # derivatives of a diverging model are clipped
 SAME_STEP = 0.01  # fraction of a step by which two steps may differ
 
@@ -326,15 +325,6 @@ class Predictive:
         """Standard errors of the parameters, by name; NaN for known ones."""
         variances = np.maximum(np.diag(self.value_covariance), 0.0)
         return self.parameters.name(np.sqrt(variances))
-
-    @property
-    def shown_errors(self) -> Values:
-        """Errors of the parameters of commands and states, such as `throttle.dead`.
-
-        Parameters that do not affect the predictions are left out.
-        """
-        errors = self.errors.items()
-        return {name: e for name, e in errors if "." in name and e > NO_ERROR}
 
 
 def fit_to_predictions(

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import FitError, RecordingError
+from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, name_sum
 from nics_drl_bridge.identify.clocks import TimingEstimate
@@ -24,7 +24,6 @@ from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.open_loop import (
     HORIZON_S,
     OpenLoop,
-    measure_open_loop_error,
     predict,
     select_windows,
 )
@@ -448,16 +447,6 @@ def describe_mirror_image(
             f"{finding}: {cause} the command is; the model moves as recorded."
         )
         return
-
-
-def try_model(
-    model: TaylorModel, calibration: Calibration, drive: Drive, t: float
-) -> OpenLoop | None:
-    """Tries a model on a drive from t [s] on; None if the rest is too short."""
-    try:
-        return measure_open_loop_error(model, calibration, drive, t, drive.duration_s)
-    except RecordingError:
-        return None
 
 
 def is_worse(error_m: float, reference_m: float) -> bool:

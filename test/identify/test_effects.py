@@ -16,6 +16,7 @@ from nics_drl_bridge.identify.effects import (
     drop_unreached_ends,
     find_input_curve,
     find_latency,
+    find_likely_latency,
     list_curve_rows,
     list_dead_zone_rows,
     list_delay_rows,
@@ -141,6 +142,14 @@ def test_the_least_delay_of_the_commands_is_their_latency(evidence):
     step = round(0.06 / evidence.samples.dt)
     assert delayed[step:, 0] == pytest.approx(alike[:-step, 0])
     assert np.array_equal(delayed[:, 1], alike[:, 1])
+
+
+def test_a_latency_is_seen_in_a_motion_that_comes_later(evidence):
+    recording = evidence.drive.recording
+    command = replace(recording.command, t=recording.command.t - 0.2)
+    drive = evidence.drive.part(replace(recording, command=command))
+    later = find_likely_latency(replace(evidence, drive=drive))
+    assert later - find_likely_latency(evidence) == pytest.approx(0.2, abs=0.021)
 
 
 def test_values_become_curves_friction_limits_and_drag(evidence):

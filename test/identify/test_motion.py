@@ -12,12 +12,12 @@ from identify.drives import fit_trial, slipping_car
 from nics_drl_bridge.identify.calibration import (
     Calibration,
     add_motion,
+    align,
     find_slopes,
     has_motion_as_state,
     make_motion_grid,
     make_surrogate,
     require_state,
-    resample_motion,
 )
 from nics_drl_bridge.identify.drive import WIDTHS_S, Drive
 from nics_drl_bridge.recording.recording import Recording, Stream
@@ -85,7 +85,7 @@ def test_the_twist_is_that_of_the_base_wherever_the_tracked_body_sits(drive):
 def test_samples_have_the_commands_in_effect_after_their_latency(drive):
     late = replace(MOUNTED, command_latency_s=0.1)
     grid = make_motion_grid(drive, late, 0.1)
-    at = resample_motion(add_motion(drive, late, grid, 0.07), late, 0.07)
+    at = align(add_motion(drive, late, grid, 0.07), late, 0.07)
     command = drive.recording.command
     row = 500
     before = np.searchsorted(command.t, at.t[row] - 0.1 + 1e-9, "right") - 1
