@@ -38,6 +38,8 @@ SMOOTHING_BURSTS = 1.5
 UNIFORM = 1e-6
 WHOLE = 1e-6  # tolerance within which a period counts as a whole number of steps
 SAME_STEP = 1e-3  # fraction of a step by which rounding of stamps may change it
+# minimum fraction of rows with common stamps for which the other rows are dropped
+SHARED = 0.5
 # rates are unknown between states further apart than this many median steps
 STATE_GAP = 2.5
 
@@ -124,13 +126,18 @@ def align(
     A drive from `add_motion` keeps the times of its state, and has poses smoothed as wide as that
     was derived [s]. Raises RecordingError without an overlap.
     """
+    # An exact drive is used bit for bit; noisy poses are smoothed by local parabolas.
     recording = drive.recording
+    period = drive.settings.control_period_s
+    shared = _find_shared_stamps(recording, period) if calibration.is_exact else None
+    if shared is not None:
+        samples = samples_on_one_clock(*shared)
+        return replace(samples, dt=find_dividing_step(period, samples.dt))
     if motion_width_s is not None:
         grid = require_state(drive).t
         step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
         half_width = 0.5 * motion_width_s
     else:
-        period = drive.settings.control_period_s
         grid, step = _make_grid(recording, calibration, period)
         half_width = SMOOTHING_BURSTS * calibration.burst_period_s
         is_noisy = calibration.position_noise_m or calibration.heading_noise_rad
@@ -192,27 +199,65 @@ def resample_states(drive: Drive, calibration: Calibration, grid: Array) -> Arra
     return np.asarray(gains * inferred[lead:])
 
 
+def _find_shared_stamps(
+    recording: Recording, period: float
+) -> tuple[Array, Array, Array, Array] | None:
+    """Returns stamps (T,), poses, states, commands of rows on a grid that divides a period."""
+    pose = recording.pose
+    state = recording.state
+    command = recording.command
+    if state is None:
+        return None
+    usual = float(np.median(np.diff(pose.t)))
+    if not usual > 0.0:
+        return None
+    step = find_dividing_step(period, usual)
+    if abs(step - usual) > SAME_STEP * usual:
+        return None
+    times = [stream.t - pose.t[0] for stream in (pose, state, command)]
+    ticks = [np.round(t / step) for t in times]
+    off = [np.abs(t - n * step).max() for t, n in zip(times, ticks, strict=True)]
+    if max(off) > UNIFORM * max(1.0, float(pose.t[-1] - pose.t[0])):
+        return None
+    by_pose, by_state, by_command = _find_shared_rows(ticks)
+    if len(by_pose) < SHARED * max(map(len, ticks)):
+        return None
+    return (
+        pose.t[by_pose],
+        pose.values[by_pose],
+        state.values[by_state],
+        command.values[by_command],
+    )
+
+
+def _find_shared_rows(ticks: list[Array]) -> tuple[NDArray[np.intp], ...]:
+    """Returns the rows of three streams whose ticks (T,) are in all of them."""
+    pose, state, command = ticks
+    shared, first, second = np.intersect1d(pose, state, return_indices=True)
+    _, both, third = np.intersect1d(shared, command, return_indices=True)
+    return first[both], second[both], third
+
+
 def _make_grid(
     recording: Recording, calibration: Calibration, period: float
 ) -> tuple[Array, float]:
-    """Returns times (T,) covered by pose, commands and state, on the commands' clock.
+    """Returns uniform times (T,) covered by pose, commands and state, on the commands' clock.
 
-    Also returns their step [s], which divides a period [s]. An exact drive keeps its own times.
+    Also returns their step [s], which divides a period [s].
     """
     pose = recording.pose.t + calibration.clock_offset_s
-    usual = float(np.median(np.diff(pose)))
-    step = find_dividing_step(period, usual)
-    is_kept = calibration.is_exact and abs(step - usual) < SAME_STEP * usual
-    is_usable = STEP_RANGE_S[0] <= usual <= STEP_RANGE_S[1]
-    if not is_kept and (calibration.burst_period_s > 0.0 or not is_usable):
-        step = find_dividing_step(period, STEP_S)
+    step = float(np.median(np.diff(pose)))
+    if (
+        calibration.burst_period_s > 0.0
+        or not STEP_RANGE_S[0] <= step <= STEP_RANGE_S[1]
+    ):
+        step = STEP_S
+    step = find_dividing_step(period, step)
     first = max(pose[0], recording.command.t[0] + calibration.command_latency_s)
     last = pose[-1]
     if recording.state is not None:
         first = max(first, recording.state.t[0])
         last = min(last, recording.state.t[-1])
-    if is_kept:
-        return pose[(pose > first - UNIFORM) & (pose < last + UNIFORM)], step
     count = int(np.floor((last - first) / step + 1e-6))
     if count < MIN_STAMPS:
         fault = f"commands and poses overlap for only {max(last - first, 0.0):.2f} s"
@@ -280,6 +325,13 @@ def measure_body_twists(
     rates = find_slopes(pose, rows, step)
     forward = geometry.rotate(rates[:, :2], -pose[:, 2])
     return np.concatenate([forward, rates[:, 2:]], axis=1)
+
+
+def smooth_commands(command: Array, step: float, width: float) -> Array:
+    """Returns commands (T, C) at uniform times, smoothed like a twist derived by parabolas."""
+    sums = np.cumsum(command, axis=0) * step
+    rows = 2 * max(2, round(width / step)) + 1
+    return find_slopes(sums, rows, step)
 
 
 def find_slopes(values: Array, rows: int, step: float) -> Array:

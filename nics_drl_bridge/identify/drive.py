@@ -1,5 +1,6 @@
 """Drive: a recording of a robot, with cached quantities that several stages derive from it."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -29,6 +30,7 @@ LEAST_WHOLE = 0.1
 NEGLIGIBLE = 1e-6  # m, rad
 REST_SAMPLES = 12
 REST_DRIFT = 3.0  # standard errors at rest; straight motion shows at least 4
+SLOPE_NOISE = 0.05
 WIDTHS_S = (0.07, 0.1, 0.15, 0.2)  # half-widths of the parabolas that give the twist
 # fraction of the usual speed, and turn rate, that the noise of a twist may reach
 NOISE = 0.02
@@ -70,6 +72,17 @@ class Drive:
         same = replace(self, settings=settings)
         vars(same).update(vars(self) | {"settings": settings})
         return same
+
+    def folds(self, count: int) -> "Iterator[tuple[Drive, Drive]]":
+        """Yields the drive without the poses of a block, and with these alone, block by block."""
+        pose = self.recording.pose
+        for block in np.array_split(np.arange(len(pose.t)), count):
+            others = np.ones(len(pose.t), dtype=np.bool_)
+            others[block] = False
+            yield (
+                self.part(replace(self.recording, pose=pose.rows(others))),
+                self.part(replace(self.recording, pose=pose.rows(block))),
+            )
 
     @property
     def duration_s(self) -> float:
@@ -114,12 +127,8 @@ class Drive:
             stride = 1
             longest = 1.8 * self.bursts.period_s
         else:
-            stride = 1
+            stride = self._find_stride()
             longest = MAX_GAP_S
-            if any(self.pose_noise or ()):
-                dt = float(np.median(np.diff(self.dated.t)))
-                span_s = min(2.0 * self.half_width_s, MAX_SPAN_S)
-                stride = max(1, round(span_s / dt))
         t = self.dated.t[::stride]
         pose = self.dated.values[::stride]
         span = np.diff(t)
@@ -127,6 +136,25 @@ class Drive:
         moved = geometry.log(geometry.between(pose[:-1], pose[1:])[usable])
         twist = moved / span[usable, None]
         return TwistIntervals(t[:-1][usable], t[1:][usable], twist)
+
+    def _find_stride(self) -> int:
+        """Returns the number of steps of the pose over which motion stands out from its noise."""
+        t = self.dated.t
+        pose = self.dated.values
+        dt = float(np.median(np.diff(t)))
+        longest = max(1, round(MAX_SPAN_S / dt))
+        moved = geometry.between(pose[:-longest:longest], pose[longest::longest])
+        twist = geometry.log(moved) / (longest * dt)
+        if not len(twist):
+            twist = np.zeros((1, 3))
+        speed = float(np.sqrt((twist[:, :2] ** 2).sum(axis=1).mean()))
+        turn = float(np.sqrt((twist[:, 2] ** 2).mean()))
+        position_noise, heading_noise = self.pose_noise or (0.0, 0.0)
+        needed_s = np.sqrt(2.0) * max(
+            position_noise / max(SLOPE_NOISE * speed, 1e-9),
+            heading_noise / max(SLOPE_NOISE * turn, 1e-9),
+        )
+        return int(np.clip(np.ceil(needed_s / dt), 1, longest))
 
     @cached_property
     def half_width_s(self) -> float:

@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
-from nics_drl_bridge.identify.calibration import (
-    Calibration,
-)
+from nics_drl_bridge.identify.calibration import Calibration, smooth_commands
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import MIDDLE_OF_STEP, roll
 from nics_drl_bridge.identify.signals import (
@@ -28,17 +26,19 @@ from nics_drl_bridge.identify.signals import (
     select_moved_commands,
     select_moved_inputs,
 )
+from nics_drl_bridge.identify.statistics import compute_unexplained
 from nics_drl_bridge.identify.terms import (
     Kind,
     Library,
     find_linear_term,
+    select_motion_terms,
     tells_lever_from_wheels,
 )
 from nics_drl_bridge.identify.yardstick import probe_structure
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
-from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.robot.taylor import TaylorModel, evaluate, list_exponents
 
 LAGS_S = (0.05, 0.15, 0.4, 1.0, 2.0)
 # trial dead zones, as fractions of the command's maximum
@@ -194,10 +194,8 @@ def list_reverse_rows(evidence: Evidence) -> Rows:
 
 
 def list_limit_rows(evidence: Evidence, state: str) -> Rows:
-    """Returns the rows of a state's maximum fall and rise, and of its lag, which these explain."""
-    rows = {}
-    if (lag := f"{state}.lag") in (lags := _list_lag_rows(evidence)):
-        rows[lag] = lags[lag]
+    """Returns the rows of a state's maximum fall and rise, and of lags, which these explain."""
+    rows = _list_lag_rows(evidence)
     for name, sign in (("fall", -1.0), ("rise", 1.0)):
         size = max(_find_strong(sign * evidence.find_rates(state)), 1e-3)
         rows[f"{state}.{name}"] = (size, 0.3 * size, 0.05 * size, 20.0 * size)
@@ -269,12 +267,17 @@ def _list_mounting_rows(evidence: Evidence) -> Rows:
     # The terms of the twist may be those of a body that is turned or moved.
     if spec.moves_sideways and (spec.state or spec.takes_cmd_vel):
         return {}
+    shown = set(evidence.calibration.uncertainty if spec.state else MOUNTING.values())
+    if not tells_lever_from_wheels(spec):
+        shown -= {"lever_arm_y_m"}
+    if not shown & set(MOUNTING.values()):
+        return {}
     reach = 2.0 * spec.footprint_radius
     lever = (0.0, LEVER_SCALE_M, -reach, reach)
+    free = {"x": lever, "y": lever, "heading": (0.0, TURN_SCALE, -np.pi, np.pi)}
     return {
-        "x": lever,
-        "y": lever if tells_lever_from_wheels(spec) else _fix(lever),
-        "heading": (0.0, TURN_SCALE, -np.pi, np.pi),
+        part: row if MOUNTING[part] in shown else _fix(row)
+        for part, row in free.items()
     }
 
 
@@ -615,25 +618,44 @@ def _drop_limits(
     return limits
 
 
-def find_likely_latency(evidence: Evidence) -> float:
-    """Returns the latency of commands [s] by which least squares best explains a motion."""
-    drive = evidence.drive
-    spec = drive.spec
+def find_likely_delay(
+    drive: Drive, calibration: Calibration, samples: Samples
+) -> float:
+    """Returns the delay [s] of the commands that best explains the rates of the state."""
     recording = drive.recording
     trials = np.arange(0.0, LONGEST_S, DELAY_STEP_S)
     if recording.pose.clock != recording.command.clock:
         trials = trials - LONGEST_S / 2.0
-    dt = evidence.samples.dt
-    count = len(evidence.samples.t)
-    stride = max(1, min(round(STRIDE_S / dt), count // ENOUGH_ROWS))
-    samples = evidence.samples.rows(np.arange(count) % stride == 0)
-    state = samples.x[:, : len(spec.state)]
-    free = [3 + i for i, v in enumerate(spec.state) if v.twist] or [0, 2]
+    width = drive.half_width_s
     left = []
-    for latency in trials:
-        begin = samples.t - latency
-        inputs = evidence.calibration.inputs
-        command = average_effect(recording.command, spec, inputs, begin, begin + dt)
-        told = replace(samples, x=np.concatenate([state, command], axis=1))
-        left.append((1.0 - evidence.library.fit(told, DELAY_ORDER).r2[free]).sum())
-    return float(trials[int(np.argmin(left))])
+    for delay in trials:
+        begin = samples.t - delay
+        command = average_effect(
+            recording.command,
+            drive.spec,
+            calibration.inputs,
+            begin,
+            begin + samples.dt,
+        )
+        smooth = smooth_commands(command, samples.dt, width)
+        left.append(_measure_unexplained(drive.spec, samples, smooth))
+    if np.isfinite(left).all():
+        return float(trials[int(np.argmin(left))])
+    return calibration.command_latency_s
+
+
+def _measure_unexplained(spec: RobotSpec, samples: Samples, command: Array) -> float:
+    """Returns the part of the state's rates that commands in effect (T, C) leave unexplained."""
+    states = len(spec.state)
+    free = [3 + i for i, v in enumerate(spec.state) if v.twist] or [0, 2]
+    # rows in between hardly differ
+    stride = max(1, min(round(STRIDE_S / samples.dt), len(command) // ENOUGH_ROWS))
+    x = np.concatenate([samples.x[:, :states], command], axis=1)[::stride]
+    rates = samples.dq[::stride]
+    powers = list_exponents(x.shape[1], DELAY_ORDER)
+    allowed = select_motion_terms(powers, spec)
+    left = 0.0
+    for d in free:
+        chi = evaluate(x, powers[allowed[d]])
+        left += float((compute_unexplained(chi, rates[:, [d]]) ** 2).mean())
+    return left

@@ -41,6 +41,8 @@ TOGETHER = 1e-3
 MIN_SAMPLES_PER_TERM = 5
 # a velocity component below this fraction of the other one is modelled as zero
 NEGLIGIBLE = 1e-3
+# a measured state is noisy if its noise exceeds this fraction of its range
+NOISY = 5e-4
 BULK = 0.75  # fraction of the rows used in the initial fit
 CONCENTRATIONS = 12
 FAR = 8.0  # an outlier is this many standard deviations of the bulk away
@@ -162,6 +164,12 @@ def list_moving_dofs(dq: Array) -> tuple[int, ...]:
     return tuple(
         d for d in range(len(size)) if d > 1 or size[d] > NEGLIGIBLE * size[:2].max()
     )
+
+
+def states_are_noisy(samples: Samples, spec: RobotSpec) -> bool:
+    """True if the noise of a measured state would bias a fit."""
+    width = np.array([v.max - v.min for v in spec.state])
+    return bool((measure_white_noise(samples.x[:, : len(width)]) > NOISY * width).any())
 
 
 def select_inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
@@ -307,6 +315,9 @@ ORDER = 2
 TWIST_ROWS = slice(3)  # rows of dQ/dt: vx, vy, wz; the rates of the states follow
 # Standardised coefficients below this fraction of the largest rate are rounding errors.
 ROUNDING = 1e-9
+# A row is one step after the previous one if it is within this fraction of a step, and this time.
+STEP_TOLERANCE = 1e-3
+STEP_TOLERANCE_S = 1e-6
 LEAST_RATE = 1e-9  # that rate is at least so large [unit of the rate]
 
 
@@ -616,9 +627,17 @@ def prune_and_refit(
     samples = regression.samples
     coefficients = np.zeros(regression.beta.shape)
     errors = np.zeros(regression.beta.shape)
+    needs_instruments = states_are_noisy(samples, spec)
     for d in regression.moving:
         kept = _select_terms(regression, d, spec, alpha)
         coefficients[d], errors[d] = _refit_terms(regression, d, kept, with_errors)
+        if needs_instruments and d >= TWIST_ROWS.stop:
+            by_instruments = _fit_by_instruments(
+                regression, d, coefficients[d], len(spec.state)
+            )
+            if by_instruments is not None:
+                terms = coefficients[d] != 0.0
+                coefficients[d, terms], errors[d, terms] = by_instruments
     used = coefficients.any(axis=0)
     model = TaylorModel(
         spec.variable_names,
@@ -677,4 +696,32 @@ def _cross_validate(
     names = [taylor.format_term(row, variables) for row in regression.powers[by_size]]
     return statistics.make_curve(
         dofs[d], tuple(names), standardised[:, by_size], target
+    )
+
+
+def _fit_by_instruments(
+    regression: Regression, d: int, coefficients: Array, state_count: int
+) -> tuple[Array, Array] | None:
+    """Returns coefficients (n,) and errors of a state's nonzero terms; None if data are too few.
+
+    A state's noise appears in X and, with the opposite sign, in its rate; least squares would take
+    that for a fast decay. The noise one step earlier is independent, so the earlier state is an
+    instrument for X. Returns None also if the instruments are too weak.
+    """
+    samples = regression.samples
+    inside = regression.inliers[d]
+    terms = np.flatnonzero(coefficients)
+    step_error = np.abs(np.diff(samples.t) - samples.dt)
+    is_next = step_error < STEP_TOLERANCE * samples.dt + STEP_TOLERANCE_S
+    rows = np.flatnonzero(is_next & inside[1:] & inside[:-1]) + 1
+    if len(terms) == 0 or len(rows) <= len(terms):
+        return None
+    x = samples.x[rows]
+    x_earlier = x.copy()
+    x_earlier[:, :state_count] = samples.x[rows - 1, :state_count]
+    powers = regression.powers[terms]
+    return statistics.fit_by_instruments(
+        taylor.evaluate(x, powers),
+        taylor.evaluate(x_earlier, powers),
+        samples.dq[rows, d],
     )

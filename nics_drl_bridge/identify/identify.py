@@ -38,7 +38,7 @@ from nics_drl_bridge.identify.effects import (
     drop_unreached_ends,
     find_input_curve,
     find_latency,
-    find_likely_latency,
+    find_likely_delay,
     make_curves,
 )
 from nics_drl_bridge.identify.findings import (
@@ -53,7 +53,6 @@ from nics_drl_bridge.identify.judgement import (
     estimate_bands,
     fit_textbook,
     judge_predictions,
-    measure_distances,
 )
 from nics_drl_bridge.identify.mounting import apply_mounting, estimate_mounting
 from nics_drl_bridge.identify.noise import add_motion_noise, measure_sensor_noise
@@ -381,7 +380,7 @@ def find_input_curves(drive: Drive, findings: Findings) -> Findings:
     """Finds the latency, and the dead zones and saturation of commands, that explain a motion."""
     if findings.motion_width_s is None:
         return findings
-    findings = _with_likely_latency(drive, findings)
+    findings = _with_likely_latency(findings)
     samples = resample_drive(findings.training, findings)
     found = [
         find_input_curve(samples, drive.spec, place)
@@ -396,18 +395,15 @@ def find_input_curves(drive: Drive, findings: Findings) -> Findings:
         calibration=replace(findings.calibration, inputs=inputs),
         clear_curves=tuple(found.curve for found in curves if found.gain >= CLEAR),
     )
-    return _with_likely_latency(drive, findings)  # the curves may hide a part of it
+    return _with_likely_latency(findings)  # the curves may hide a part of it
 
 
-def _with_likely_latency(drive: Drive, findings: Findings) -> Findings:
-    """Returns findings with the latency of commands that best explains a motion, if one does."""
-    training = findings.training
+def _with_likely_latency(findings: Findings) -> Findings:
+    """Returns findings with the latency of commands that best explains a motion."""
     calibration = findings.calibration
-    samples = resample_drive(training, findings)
-    library = make_library(drive, findings)
-    with suppress(FitError):
-        latency = find_likely_latency(Evidence(training, calibration, samples, library))
-        calibration = replace(calibration, command_latency_s=latency)
+    samples = resample_drive(findings.training, findings)
+    latency = find_likely_delay(findings.training, calibration, samples)
+    calibration = replace(calibration, command_latency_s=latency)
     return replace(findings, calibration=calibration)
 
 
@@ -478,12 +474,13 @@ def make_library(drive: Drive, findings: Findings) -> Library:
     """Returns the terms that the model of a drive may have."""
     order = drive.settings.order
     if not drive.spec.state or findings.motion_width_s is not None:
-        return Library(drive.spec, Kind.MOTION, 1.0, selection.BASE_ORDER)
+        return Library(drive.spec, Kind.MOTION, True, 1.0, selection.BASE_ORDER)
     kind = Kind.FOLLOWER if drive.recording.state is None else Kind.MEASURED
+    centred = "lever_arm_y_m" in findings.calibration.uncertainty
     if order == "auto":
         is_short = findings.training.duration_s < SHORT_S
         order = fitting.ORDER if kind is Kind.MEASURED or is_short else MAX_ORDER
-    return Library(drive.spec, kind, drive.settings.alpha, order)
+    return Library(drive.spec, kind, centred, drive.settings.alpha, order)
 
 
 def prune_terms(drive: Drive, findings: Findings) -> Findings:
@@ -629,23 +626,17 @@ def judge_model(drive: Drive, findings: Findings) -> Findings:
 
 def _find_bands(drive: Drive, findings: Findings) -> dict[float, float]:
     """Returns the distances within which 95 % of predictions should end [m], by horizon [s]."""
-    if (
-        findings.calibration.is_exact
-        or drive.duration_s <= drive.settings.train_until_s
-    ):
-        return {}
-    if not findings.replacement:
-        trial = selection.choose_trial(findings.trials, drive.settings.order)
-        return estimate_bands(trial.errors)
     model = require_model(findings)
-    return estimate_bands(
-        {
-            horizon: measure_distances(
-                model, findings.calibration, findings.training, horizon
-            )
-            for horizon in selection.BANDS_S
-        }
-    )
+    calibration = findings.calibration
+    training = findings.training
+    if findings.replacement:
+        return estimate_bands(model, calibration, training, fixed=True)
+    if calibration.is_exact or drive.duration_s <= drive.settings.train_until_s:
+        return {}
+    derived = None
+    if findings.base is not None:
+        derived = resample_drive(training, findings), findings.base
+    return estimate_bands(model, calibration, training, derived)
 
 
 def prefer_textbook(drive: Drive, findings: Findings) -> Findings:

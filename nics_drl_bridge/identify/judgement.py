@@ -1,19 +1,21 @@
 """Judgement of a model: predictions of unseen data beside those of yardsticks, and a verdict."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify import selection
+from nics_drl_bridge.identify import selection, shooting
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.effects import Evidence
 from nics_drl_bridge.identify.open_loop import (
     SPACING_S,
     Windows,
@@ -25,6 +27,7 @@ from nics_drl_bridge.identify.yardstick import (
     fit_yardstick,
     predict_kept_twist,
 )
+from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 
 JUDGED_S = 5.0  # horizon of the predictions that decide on a model
@@ -280,6 +283,9 @@ def list_doubts_of_commands(
 
 
 HORIZONS_S = (*selection.BANDS_S, 10.0)
+FOLDS = 5
+# limit for the fits to all parts but one, which start from the fit to all parts
+EVALUATIONS = 8
 # percentage of ends within a band, and the minimum number of ends for it
 WITHIN = 95.0
 FEWEST = 20
@@ -369,16 +375,42 @@ def average_end_errors(ends: Array, chosen: Windows) -> EndErrors:
     return EndErrors(float(np.hypot(*apart[:, :2].T).mean()), float(heading))
 
 
-def estimate_bands(distances: Mapping[float, Array]) -> dict[float, float]:
-    """Returns the distances [m] within which 95 % of predictions should end, by horizon [s].
+def estimate_bands(
+    model: TaylorModel,
+    calibration: Calibration,
+    training: Drive,
+    derived: tuple[Samples, selection.Base] | None = None,
+    fixed: bool = False,
+) -> dict[float, float]:
+    """Returns the distances [m] within which 95 % of predictions are expected to end, by horizon.
 
-    `distances` (W,) are those of predictions that a fit did not see, by horizon [m].
+    Each fold of the training part is predicted by the model adjusted to the others. `derived` are
+    the samples of the training part, and the base that the model departed from. A
+    `fixed` model is not adjusted, and predicts the whole part.
     """
-    return {
-        horizon: float(np.percentile(far, WITHIN))
-        for horizon, far in distances.items()
-        if len(far) >= FEWEST
-    }
+    errors: dict[float, list[Array]] = {h: [] for h in selection.BANDS_S}
+    folds = [(training, training)] if fixed else training.folds(FOLDS)
+    for _, part in folds:
+        adjusted = model, calibration
+        if derived is not None:
+            kept = _select_rows_outside(derived[0], part, calibration)
+            adjusted = _adjust_to_rows(model, calibration, training, *derived, kept)
+        for horizon, parts in errors.items():
+            parts.append(measure_distances(*adjusted, part, horizon))
+    bands = {}
+    for horizon, parts in errors.items():
+        far = np.concatenate(parts)
+        if len(far) >= FEWEST:
+            bands[horizon] = float(np.percentile(far, WITHIN))
+    return bands
+
+
+def _select_rows_outside(
+    samples: Samples, part: Drive, calibration: Calibration
+) -> NDArray[np.bool_]:
+    """Selects the samples (T,) outside a part of the drive."""
+    begin, end = part.recording.pose.t[[0, -1]] + calibration.clock_offset_s
+    return np.asarray((samples.t < begin) | (samples.t > end))
 
 
 def measure_distances(
@@ -389,3 +421,22 @@ def measure_distances(
     if not len(chosen.start_t):
         return np.zeros(0)
     return measure_end_distances(predict(model, calibration, part, chosen), chosen)
+
+
+def _adjust_to_rows(
+    model: TaylorModel,
+    calibration: Calibration,
+    training: Drive,
+    samples: Samples,
+    base: selection.Base,
+    kept: NDArray[np.bool_],
+) -> tuple[TaylorModel, Calibration]:
+    """Adjusts a model, and its inputs, to the rows that are kept (T,)."""
+    evidence = Evidence(training, calibration, samples, base.draft.library)
+    draft = selection.Draft.of(evidence, base.draft.problem.parameters)
+    problem = replace(draft.problem, spacing_s=selection.SPACING_S)
+    free = draft.library.select_free(model)
+    pull = selection.PULLS[-1]
+    fitted = shooting.fit_to_predictions(problem, model, free, kept, EVALUATIONS, pull)
+    calibration = draft.calibrate(fitted, calibration)
+    return replace(fitted.model, inputs=calibration.inputs), calibration

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array, rotate, wrap_angle
@@ -11,6 +12,7 @@ from nics_drl_bridge.identify.calibration import Calibration, has_motion_as_stat
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import (
     average_held,
+    find_speed_index,
     list_followed_commands,
 )
 from nics_drl_bridge.identify.statistics import (
@@ -18,7 +20,9 @@ from nics_drl_bridge.identify.statistics import (
     estimate_clustered_errors,
     estimate_standard_errors,
 )
-from nics_drl_bridge.identify.terms import has_slipping_tyres
+from nics_drl_bridge.identify.terms import has_slipping_tyres, list_reversed_variables
+from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.kernels import MAX_ORDER
 from nics_drl_bridge.robot.kinds import (
     compute_steady_twist,
     has_textbook,
@@ -38,6 +42,7 @@ FLAT = 0.02
 MIN_LENGTH = 1e-4  # m, rad
 BLOCKS = 8
 STRONG = 10.0  # instruments with a smaller F are weak (Staiger, Stock 1997)
+SAME = 1e-6  # minimum part of an instrument that differs from the others
 RIDGE = 1e-12  # regularisation, relative to the noise, for a drive without any
 
 
@@ -83,11 +88,82 @@ def estimate_mounting(drive: Drive, timing: clocks.TimingEstimate) -> Mounting |
     forward = _predict_twists(spec, command)[:, 0]
     _, noise = drive.pose_noise or (0.0, 0.0)
     mounting = estimate_mounting_without_lateral_motion(twists, forward, noise)
-    may_slip = has_slipping_tyres(spec) or slips(spec)
-    is_derived = not spec.state or has_motion_as_state(spec, drive.recording)
-    if mounting is not None and may_slip and is_derived:
-        return estimate_mounting_with_slip(twists, mounting, spec)
+    if mounting is None:
+        return None
+    if not spec.state or has_motion_as_state(spec, drive.recording):
+        if has_slipping_tyres(spec) or slips(spec):
+            return estimate_mounting_with_slip(twists, mounting, spec)
+        return mounting
+    states = clocks.average_expected_states(drive, twists, timing)
+    if drive.recording.state is None or np.isnan(mounting.lever_sigma[0]):
+        mounting = (
+            estimate_mounting_by_instruments(twists, states, forward, spec) or mounting
+        )
+    place = find_speed_index(spec)
+    if place is not None and np.isnan(mounting.lever_sigma).tolist() == [False, True]:
+        mounting.lever[1], mounting.lever_sigma[1] = estimate_lateral_lever(
+            twists, mounting.rotation, states[:, place]
+        )
     return mounting
+
+
+def estimate_mounting_by_instruments(
+    motion: TwistIntervals, states: Array, forward: Array, spec: RobotSpec
+) -> Mounting | None:
+    """Estimates the mounting by instruments from the states (n, S); None if these are too weak."""
+    powers = taylor.list_exponents(states.shape[1], MAX_ORDER)
+    chi = taylor.evaluate(
+        states / np.maximum(np.abs(states).max(axis=0), STILL), powers
+    )
+    basis = scipy.linalg.orth(chi, rcond=SAME)
+    seen = basis @ (basis.T @ motion.twist)
+    normal = _find_still_direction(motion.twist, seen, basis.shape[1])
+    if normal is None:
+        return None
+    if float(motion.twist[:, :2] @ [normal[1], -normal[0]] @ forward) < 0.0:
+        normal = -normal
+    travel = float(np.arctan2(-normal[0], normal[1]))
+    ahead = rotate(seen[:, :2], -travel)[:, :1]
+    sigma = estimate_standard_errors(
+        np.hstack([ahead, seen[:, 2:]]), motion.twist @ normal
+    )
+    if CERTAIN * sigma[1] > spec.footprint_radius:
+        return None
+    odd = list_reversed_variables(spec) or ()
+    aside = powers[:, [v.name in odd for v in spec.state]].sum(axis=1) % 2 == 1
+    across = 0.0, np.nan
+    if aside.any():  # motion along x is even in what a mirror reverses
+        even = np.hstack([scipy.linalg.orth(chi[:, ~aside], rcond=SAME), seen[:, 2:]])
+        across = _estimate_lever_by_mirror(motion, travel, even)
+    lever, lever_sigma = np.transpose([(-normal[2], sigma[1]), across])
+    return Mounting(travel, lever, float(sigma[0]), lever_sigma, 2)
+
+
+def _find_still_direction(twist: Array, seen: Array, size: int) -> Array | None:
+    """Returns the direction (3,) in which twists (n, 3) have no extent, by `size` instruments.
+
+    `seen` (n, 3) is what the instruments explain of them. None if the instruments are too weak.
+    """
+    # The states are independent of the twists' noise, and what they do along x they do not do along
+    # y: limited-information maximum likelihood (Anderson, Rubin 1949).
+    noise = (twist - seen).T @ (twist - seen)
+    power = seen.T @ seen
+    noise += RIDGE * np.trace(power + noise) * np.eye(3)
+    strength, axes = scipy.linalg.eigh(power, noise)
+    flat = float(np.hypot(*axes[:2, 0]) / np.linalg.norm(axes[:, 0]))
+    if not strength[1] * (len(twist) - size) / size > STRONG or flat < FLAT:
+        return None
+    return np.asarray(axes[:, 0] / np.hypot(*axes[:2, 0]))
+
+
+def _estimate_lever_by_mirror(
+    motion: TwistIntervals, travel: float, even: Array
+) -> tuple[float, float]:
+    """Returns the lever arm along y and its error from features (n, K), the last the turn rate."""
+    along = rotate(motion.twist[:, :2], -travel)[:, 0]
+    beta = np.linalg.lstsq(even, along, rcond=None)[0]
+    rest = along - even[:, :-1] @ beta[:-1] - beta[-1] * motion.twist[:, 2]
+    return -float(beta[-1]), float(estimate_standard_errors(even, rest)[-1])
 
 
 def estimate_mounting_with_slip(
@@ -199,6 +275,20 @@ def _count_turns(motion: TwistIntervals, noise: float) -> int:
     turn = motion.twist[:, 2]
     span = motion.end - motion.start
     return _count_ways(turn, np.abs(turn) > CERTAIN * np.sqrt(2.0) * noise / span)
+
+
+def estimate_lateral_lever(
+    motion: TwistIntervals, rotation: float, speed: Array
+) -> tuple[float, float]:
+    """Estimates the lever arm along y and its uncertainty [m] from a speed (n,); may be NaN."""
+    # `ux = gain speed - lever_y wz`: the outside of a curve is faster.
+    along = rotate(motion.twist[:, :2], -rotation)[:, 0]
+    chi = np.stack([speed, motion.twist[:, 2]], axis=1)
+    size = np.linalg.svd(chi * np.array([1.0, TURN_SCALE_M]), compute_uv=False)
+    if size[1] < 2.0 * MIN_SECOND * size[0]:
+        return 0.0, float("nan")
+    beta = np.linalg.lstsq(chi, along, rcond=None)[0]
+    return -float(beta[1]), float(estimate_standard_errors(chi, along - chi @ beta)[1])
 
 
 def _estimate_by_commands(

@@ -11,6 +11,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.taylor import TaylorModel
 
+WEAK = 1e4  # condition number of instruments x features above which instruments are too weak
 CLUSTERS = 60  # stretches of rows whose errors are taken to be independent
 # minimum ratio of a term of a noisy fit, or of a correction, to its standard error
 CERTAIN = 3.0
@@ -225,6 +226,24 @@ def select_significant(chi: Array, target: Array) -> NDArray[np.bool_]:
             break
         keep[np.flatnonzero(keep)[int(np.argmin(ratio))]] = False
     return keep
+
+
+def fit_by_instruments(
+    chi: Array, instruments: Array, target: Array
+) -> tuple[Array, Array] | None:
+    """Returns coefficients (K,) and errors by instruments (T, K); None if these are too weak."""
+    # Two-stage least squares (Soederstroem, Stoica 1983).
+    scale = np.linalg.norm(chi, axis=0)
+    instruments = instruments / np.linalg.norm(instruments, axis=0)
+    bread = instruments.T @ chi / scale
+    if not np.linalg.cond(bread) < WEAK:
+        return None
+    inverse = np.linalg.inv(bread)
+    beta = inverse @ (instruments.T @ target) / scale
+    scores = instruments * (target - chi @ beta)[:, None]
+    sums = [part.sum(axis=0) for part in np.array_split(scores, CLUSTERS)]
+    errors = np.linalg.norm(np.array(sums) @ inverse.T, axis=0)
+    return beta, errors / scale
 
 
 @dataclass(frozen=True)

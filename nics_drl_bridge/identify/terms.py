@@ -77,12 +77,14 @@ class Library:
     Attributes:
         spec: the robot.
         kind: where its state comes from.
+        centred: True if poses are those of the robot's reference point.
         alpha: threshold of the pruning (Eq. 2); a motion's terms are not pruned.
         order: of the base, from which other models depart; a motion's base is its textbook.
     """
 
     spec: RobotSpec
     kind: Kind
+    centred: bool
     alpha: Alpha
     order: int
 
@@ -92,7 +94,7 @@ class Library:
             return fit_motion_terms(samples, self.spec, order, select_motion_terms)
         through = None
         if self.kind is Kind.FOLLOWER:
-            through = select_terms_through_state
+            through = partial(select_terms_through_state, centred=self.centred)
         regression = regress(samples, self.spec, order, True, through)
         fit = prune_and_refit(regression, self.spec, self.alpha, with_errors)
         return replace(fit, model=self._define(fit.model))
@@ -123,7 +125,9 @@ class Library:
         if self.kind is Kind.MEASURED:
             return self.fit(samples, self.order).model
         if self.kind is Kind.FOLLOWER:
-            through = partial(select_terms_through_state, by_book=True)
+            through = partial(
+                select_terms_through_state, centred=self.centred, by_book=True
+            )
             regression = regress(samples, self.spec, self.order, False, through)
             fit = prune_and_refit(regression, self.spec, 1.0, with_errors=False)
             return self._define(fit.model)
@@ -135,10 +139,9 @@ class Library:
         free = model.coefficients != 0.0
         if self.kind is Kind.MOTION:
             return np.asarray(free & ~select_defined_dofs(self.spec)[:, None])
-        if self.kind is Kind.FOLLOWER:
-            free[FIRST_STATE:] = False
-            is_speed = self._select_inferred_speed(model)
-            free[VX, is_speed & (model.coefficients[VX] == 1.0)] = False
+        free[FIRST_STATE:] = False
+        is_speed = self._select_inferred_speed(model)
+        free[VX, is_speed & (model.coefficients[VX] == 1.0)] = False
         return np.asarray(free)
 
 
@@ -310,16 +313,17 @@ def select_listed(powers: Powers, terms: Sequence[Powers] | Powers) -> Mask:
 
 
 def select_terms_through_state(
-    powers: Powers, spec: RobotSpec, by_book: bool = False
+    powers: Powers, spec: RobotSpec, centred: bool, by_book: bool = False
 ) -> Mask:
     """Selects the terms (D, K) of a robot whose states follow commands and were not measured.
 
-    The twist depends on the state alone, and the rate of a state on itself and its command. Mirror
-    symmetry holds for vx in all terms, for vy and wz beyond the first order.
+    The twist depends on the state alone, and the rate of a state on itself and its command.
 
     Args:
         powers: (K, V) exponents of the terms.
         spec: the robot.
+        centred: True if poses are those of the robot's reference point, so that mirror symmetry
+            must hold: for vx in all terms, for vy and wz beyond the first order.
         by_book: allows only the terms by which the textbook's twist can be expanded.
     """
     names = spec.variable_names
@@ -332,7 +336,7 @@ def select_terms_through_state(
     allowed[TWIST] = select_twist_terms(powers, spec, unmoved)
     if by_book:
         allowed[TWIST] &= _select_textbook_twist(powers, spec)
-    if reversed_names is not None:
+    if reversed_names is not None and centred:
         is_odd = _are_odd(powers, names, reversed_names)
         allowed[VX] &= ~is_odd
         allowed[VX + 1 : FIRST_STATE] &= is_odd | (order <= 1)

@@ -16,7 +16,7 @@ from nics_drl_bridge.identify.effects import (
     drop_unreached_ends,
     find_input_curve,
     find_latency,
-    find_likely_latency,
+    find_likely_delay,
     list_curve_rows,
     list_dead_zone_rows,
     list_delay_rows,
@@ -40,7 +40,7 @@ from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-MOTION = Library(throttle_car(), Kind.MOTION, 1.0, 3)
+MOTION = Library(throttle_car(), Kind.MOTION, True, 1.0, 3)
 CURVE = InputCurve(command="throttle", dead=0.05, least=-0.3, most=0.5)
 
 
@@ -145,11 +145,14 @@ def test_the_least_delay_of_the_commands_is_their_latency(evidence):
 
 
 def test_a_latency_is_seen_in_a_motion_that_comes_later(evidence):
-    recording = evidence.drive.recording
-    command = replace(recording.command, t=recording.command.t - 0.2)
-    drive = evidence.drive.part(replace(recording, command=command))
-    later = find_likely_latency(replace(evidence, drive=drive))
-    assert later - find_likely_latency(evidence) == pytest.approx(0.2, abs=0.021)
+    drive = evidence.drive
+    command = replace(drive.recording.command, t=drive.recording.command.t - 0.2)
+    later = drive.part(replace(drive.recording, command=command))
+    at_once, late = (
+        find_likely_delay(each, evidence.calibration, evidence.samples)
+        for each in (drive, later)
+    )
+    assert late - at_once == pytest.approx(0.2, abs=0.021)
 
 
 def test_values_become_curves_friction_limits_and_drag(evidence):

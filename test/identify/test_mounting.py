@@ -6,6 +6,7 @@ import pytest
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.drive import TwistIntervals
 from nics_drl_bridge.identify.mounting import (
+    estimate_mounting_by_instruments,
     estimate_mounting_by_twists,
     estimate_mounting_with_slip,
     estimate_mounting_without_lateral_motion,
@@ -36,6 +37,59 @@ def test_a_robot_that_keeps_its_heading_and_goes_anywhere_tells_nothing_of_its_m
     twist = np.stack([np.cos(course), np.sin(course), 0.0 * course], axis=1)
     motion = TwistIntervals(n, n + 1.0, twist)
     assert estimate_mounting_without_lateral_motion(motion, np.ones(50)) is None
+
+
+def seen_by(car, curvature, lever, seed=0, count=900):
+    """States and noisy twists of a point on a car, which goes along curvatures (n,) [1/m]."""
+    rng = np.random.default_rng(seed)
+    speed = np.repeat(rng.uniform(0.3, 1.0, count // 10), 10)
+    turn = speed * curvature
+    twist = np.stack([speed - lever[1] * turn, lever[0] * turn, turn], axis=1)
+    twist += rng.normal(size=twist.shape) * [0.02, 0.02, 0.05]
+    n = np.arange(count)
+    states = np.stack([speed, np.arctan(0.2 * curvature)], axis=1)
+    return TwistIntervals(0.1 * n, 0.1 * n + 0.1, twist), states
+
+
+def test_the_lever_of_a_car_that_turned_little_both_ways_is_found_with_its_error(car):
+    off = []
+    for seed in range(8):
+        bends = np.random.default_rng(100 + seed).uniform(-0.4, 0.4, 90)
+        motion, states = seen_by(car, np.repeat(bends, 10), (0.08, -0.03), seed)
+        plain = estimate_mounting_without_lateral_motion(motion, states[:, 0])
+        assert plain is not None
+        assert np.isnan(
+            plain.lever_sigma[0]
+        )  # its noise is too large for the plain one
+        found = estimate_mounting_by_instruments(motion, states, states[:, 0], car)
+        assert found is not None
+        assert (found.lever_sigma < 0.008).all()
+        off.append(
+            [
+                *(found.lever - [0.08, -0.03]) / found.lever_sigma,
+                found.rotation / found.rotation_sigma,
+            ]
+        )
+    assert np.abs(off).max() < 3.5
+    assert np.abs(off).mean() > 0.3  # the errors are not too wide either
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.005])
+def test_a_path_of_one_curvature_tells_no_lever(car, spread):
+    bends = 0.8 + spread * np.repeat(
+        np.random.default_rng(0).uniform(-1.0, 1.0, 90), 10
+    )
+    motion, states = seen_by(car, bends, (0.08, 0.0))
+    assert estimate_mounting_by_instruments(motion, states, states[:, 0], car) is None
+
+
+def test_a_car_that_drives_backwards_first_faces_where_it_is_told_to(car):
+    bends = np.repeat(np.random.default_rng(1).uniform(-2.0, 2.0, 90), 10)
+    motion, states = seen_by(car, bends, (0.08, 0.0))
+    found = estimate_mounting_by_instruments(motion, states, -states[:, 0], car)
+    assert found is not None
+    assert abs(found.rotation) == pytest.approx(np.pi, abs=0.01)
+    assert found.lever[0] == pytest.approx(-0.08, abs=0.005)
 
 
 @pytest.mark.parametrize(("bend", "ways"), [(0.0, 0), (0.5, 1), (-0.5, 1)])

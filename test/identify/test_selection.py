@@ -40,7 +40,7 @@ from nics_drl_bridge.identify.selection import (
 from nics_drl_bridge.identify.shooting import Parameters, Shooting
 from nics_drl_bridge.identify.terms import Kind, Library
 
-MOTION = Library(throttle_car(), Kind.MOTION, 1.0, 3)
+MOTION = Library(throttle_car(), Kind.MOTION, True, 1.0, 3)
 
 
 @pytest.mark.slow

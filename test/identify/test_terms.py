@@ -28,7 +28,7 @@ from nics_drl_bridge.robot.spec import RobotSpec, build_robot
 def test_a_textbook_of_a_front_driven_tricycle_is_expanded_with_its_trim():
     spec = tricycle()
     powers = taylor.list_exponents(4, 4)
-    allowed = select_terms_through_state(powers, spec, by_book=True)
+    allowed = select_terms_through_state(powers, spec, centred=True, by_book=True)
     names = np.array([taylor.format_term(row, spec.variable_names) for row in powers])
     along, across, turn = ({*names[row]} for row in allowed[:3])
     assert along == {"speed", "speed*steering^2"}
@@ -39,7 +39,7 @@ def test_a_textbook_of_a_front_driven_tricycle_is_expanded_with_its_trim():
 def test_a_variable_that_never_moved_is_a_factor_of_the_textbooks_terms():
     spec = tricycle()
     powers = np.array([[0, 0, 0, 0], [1, 0, 0, 0], [2, 0, 0, 0], [0, 0, 1, 0]])
-    allowed = select_terms_through_state(powers, spec, by_book=True)
+    allowed = select_terms_through_state(powers, spec, centred=True, by_book=True)
     assert allowed[:3].tolist() == [
         [False, True, False, False],
         [False, False, False, False],
@@ -54,19 +54,19 @@ def test_lateral_motion_is_kept_where_a_state_measures_it():
     dq = np.stack([x[:, 0], 0.3 * x[:, 1], x[:, 0] * x[:, 1], *x[:, 2:].T], axis=1)
     t = 0.01 * np.arange(400)
     samples = Samples(t, np.zeros((400, 5)), x, dq, 0.01)
-    plain = Library(spec, Kind.MEASURED, 1.0, 2).fit(samples, 2).model
+    plain = Library(spec, Kind.MEASURED, True, 1.0, 2).fit(samples, 2).model
     assert not plain.coefficients[1].any()
     speed, steering = spec.state
     slip = steering.model_copy(update={"twist": "vy", "follows": None, "unit": "m/s"})
     slides = spec.model_copy(update={"state": (speed, slip)})
-    kept = Library(slides, Kind.MEASURED, 1.0, 2).fit(samples, 2).model
+    kept = Library(slides, Kind.MEASURED, True, 1.0, 2).fit(samples, 2).model
     assert kept.coefficients[1].any()
 
 
 def test_a_mirror_leaves_even_terms_along_x_and_odd_ones_across():
     spec = tricycle()
     powers = taylor.list_exponents(4, 4)
-    allowed = select_terms_through_state(powers, spec)
+    allowed = select_terms_through_state(powers, spec, centred=True)
     names = [taylor.format_term(row, spec.variable_names) for row in powers]
     along, across = (
         [n for n, each in zip(names, allowed[d], strict=True) if each] for d in (0, 2)
@@ -76,6 +76,8 @@ def test_a_mirror_leaves_even_terms_along_x_and_odd_ones_across():
     assert {"speed", "speed*steering", "speed*steering^3"} <= set(across)
     assert "speed*steering^2" not in across
     assert not any("command" in name for name in along + across)
+    sided = select_terms_through_state(powers, spec, centred=False)
+    assert sided[0][names.index("speed*steering")]
 
 
 def test_a_mirror_turns_the_steering_and_what_it_moves_aside():

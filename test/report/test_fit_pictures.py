@@ -91,7 +91,7 @@ def test_a_short_drive_has_fewer_pictures(found, blank):
 
 def predicted(identified, kind: Kind):
     """The result of a drive whose terms predictions chose from a kind of library."""
-    library = Library(identified.drive.spec, kind, "auto", 3)
+    library = Library(identified.drive.spec, kind, True, "auto", 3)
     draft = Draft(Evidence(None, None, None, library), problem=None)
     base = Base(draft, found=None)
     return replace(identified, findings=replace(identified.findings, base=base))
