@@ -151,7 +151,7 @@ def _list_delay_row(evidence: Evidence) -> Row:
 def list_delay_rows(evidence: Evidence) -> Rows:
     """Returns a delay of each command that moved, in place of one latency; none if only one did."""
     names = [command for _, command in evidence.followed]
-    if not names:
+    if evidence.library.kind is Kind.MOTION:
         moved = select_moved_commands(evidence.drive.recording.command).tolist()
         pairs = zip(evidence.drive.spec.command, moved, strict=True)
         names = [command.name for command, has_moved in pairs if has_moved]

@@ -18,6 +18,7 @@ from nics_drl_bridge.identify.calibration import (
     make_motion_grid,
     make_surrogate,
     require_state,
+    smooth_commands,
 )
 from nics_drl_bridge.identify.drive import WIDTHS_S, Drive
 from nics_drl_bridge.recording.recording import Recording, Stream
@@ -114,6 +115,16 @@ def test_poses_that_are_known_to_be_doubtful_do_not_bend_the_motion(drive):
         found = require_state(add_motion(seen, MOUNTED, grid, 0.07)).values
         off.append(np.abs(found - truth).mean())
     assert off[1] < 0.1 * off[0]
+
+
+def test_commands_are_as_smooth_as_the_twist_so_that_they_begin_and_end_together():
+    step = 0.02
+    width = 0.25
+    speed = np.where(np.arange(400) * step < 4.0, 0.2, 0.6)[:, None]
+    smooth = smooth_commands(speed, step, width)[:, 0]
+    changed = np.flatnonzero((smooth > 0.201) & (smooth < 0.599)) * step
+    assert changed[[0, -1]] == pytest.approx([4.0 - width, 4.0 + width], abs=0.05)
+    assert smooth[100:-100].mean() == pytest.approx(0.4, abs=0.01)
 
 
 @pytest.mark.slow
