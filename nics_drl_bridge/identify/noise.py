@@ -119,10 +119,8 @@ def _predict_errors(
     )
     if len(chosen.start_t) < MIN_WINDOWS:
         return None
-    if drive.recording.state is None:
-        ends = open_loop.predict(model, calibration, drive, chosen)
-    else:  # restart from the measured state, so that its drift is not counted twice
-        ends = open_loop.predict_along_states(model, calibration, drive, chosen)
+    # along a measured state, so that its drift is not counted twice
+    ends = open_loop.predict(model, calibration, drive, chosen, along_states=True)
     return chosen, geometry.between(ends, chosen.end)
 
 
