@@ -66,7 +66,7 @@ def _compile(
     # Spawned, not forked: a fork could inherit a lock that is never released.
     with get_context("spawn").Pool(WORKERS, _begin, (for_wheel,)) as pool:
         *first, model = pool.apply(_compile_by, (_model,))
-        compiled = [first]
+        compiled = [tuple(first)]
         for parts in rounds:
             jobs = [pool.apply_async(_compile_by, (part, model)) for part in parts]
             compiled += [job.get()[:2] for job in jobs]
