@@ -22,7 +22,7 @@ from scipy.ndimage import uniform_filter1d
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.calibration import Calibration, choose_half_width
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, select_windows
 from nics_drl_bridge.identify.shooting import HEADING_ARM_M
@@ -359,7 +359,7 @@ def learn_sparse(
     t = np.arange(drive.dated.t[0], drive.recording.pose.t[0] + stop, STEP_S)
     twist = estimate_twists_at(drive, t)
     # Commands are smoothed as the twists are: over the poses of a parabola, and by SINDy's filter.
-    half = round(0.77 * drive.half_width_s / STEP_S)
+    half = round(0.77 * choose_half_width(drive) / STEP_S)
     command = uniform_filter1d(
         lesson.commands_at(t - lesson.textbook.response.delay_s), 2 * half + 1, axis=0
     )

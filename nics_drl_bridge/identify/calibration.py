@@ -113,19 +113,8 @@ class Calibration:
         return geometry.compose(base, self.mounting)
 
 
-def name_sum(state: str) -> str:
-    """Returns the name of the uncertainty of a latency and a lag together."""
-    return f"command_latency_and_{state}_lag_s"
-
-
-def align(
-    drive: Drive, calibration: Calibration, motion_width_s: float | None = None
-) -> Samples:
-    """Resamples a drive on one time axis, at `base_link`, without its gaps.
-
-    A drive from `add_motion` keeps the times of its state, and has poses smoothed as wide as that
-    was derived [s]. Raises RecordingError without an overlap.
-    """
+def align(drive: Drive, calibration: Calibration) -> Samples:
+    """Resamples a drive on one time axis, at `base_link`; RecordingError without an overlap."""
     # An exact drive is used bit for bit; noisy poses are smoothed by local parabolas.
     recording = drive.recording
     period = drive.settings.control_period_s
@@ -133,16 +122,28 @@ def align(
     if shared is not None:
         samples = samples_on_one_clock(*shared)
         return replace(samples, dt=find_dividing_step(period, samples.dt))
-    if motion_width_s is not None:
-        grid = require_state(drive).t
-        step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
-        half_width = 0.5 * motion_width_s
-    else:
-        grid, step = _make_grid(recording, calibration, period)
-        half_width = SMOOTHING_BURSTS * calibration.burst_period_s
-        is_noisy = calibration.position_noise_m or calibration.heading_noise_rad
-        if not half_width and is_noisy:
-            half_width = SMOOTHING_S
+    grid, step = _make_grid(recording, calibration, period)
+    half_width = SMOOTHING_BURSTS * calibration.burst_period_s
+    if not half_width and (
+        calibration.position_noise_m or calibration.heading_noise_rad
+    ):
+        half_width = SMOOTHING_S
+    return resample_drive(drive, calibration, grid, step, half_width)
+
+
+def resample_drive(
+    drive: Drive, calibration: Calibration, grid: Array, step: float, half_width: float
+) -> Samples:
+    """Resamples a drive at times (T,) on the commands' clock, without its gaps.
+
+    Args:
+        drive: the drive.
+        calibration: of the drive.
+        grid: (T,) times, a whole number of steps apart [s].
+        step: [s].
+        half_width: of the parabolas that smooth the poses [s]; 0 for none.
+    """
+    recording = drive.recording
     begin = grid - calibration.command_latency_s
     samples = samples_on_one_clock(
         grid,
@@ -276,6 +277,10 @@ def select_outside_gaps(
     return np.asarray(gap < max(least, usual * float(np.median(np.diff(samples)))))
 
 
+WIDTHS_S = (0.07, 0.1, 0.15, 0.2)  # half-widths of the parabolas that give the twist
+# fraction of the usual speed, and turn rate, that the noise of a twist may reach
+NOISE = 0.02
+SAMPLES = 2.5  # minimum number of samples in half a width
 # steps of models, by the step of the poses
 FINE_S = 0.01
 COARSE_S = 0.02
@@ -287,6 +292,24 @@ def has_motion_as_state(spec: RobotSpec, recording: Recording) -> bool:
     if recording.state is not None:
         return False
     return any(v.twist for v in spec.state) or not (spec.state or spec.takes_cmd_vel)
+
+
+def choose_half_width(drive: Drive) -> float:
+    """Returns the half-width [s] for smoothing poses: the shortest that reduces noise enough."""
+    t = drive.dated.t
+    pose = unwrap_headings(drive.dated.values)
+    span = float(t[-1] - t[0])
+    every = span / max(len(t) - 1, 1)
+    speed = np.hypot(*np.diff(pose[:, :2], axis=0).T).sum() / span
+    turn = np.abs(np.diff(pose[:, 2])).sum() / span
+    position, heading = drive.pose_noise or (0.0, 0.0)
+    for width in WIDTHS_S:
+        gain = np.sqrt(12.0 * every / (2.0 * width)) / (2.0 * width)
+        if gain * position <= NOISE * speed and gain * heading <= NOISE * max(
+            turn, speed
+        ):
+            break
+    return float(max(width, SAMPLES * every))
 
 
 def add_motion(
@@ -362,6 +385,13 @@ def _infer_follower(
     latency = calibration.command_latency_s
     command = drive.recording.command
     return infer_states(command, alone, np.array(lag), latency, t)[:, 0]
+
+
+def resample_motion(drive: Drive, calibration: Calibration, width: float) -> Samples:
+    """Resamples a drive from `add_motion` at the times of its state, with poses smoothed alike."""
+    grid = require_state(drive).t
+    step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
+    return resample_drive(drive, calibration, grid, step, 0.5 * width)
 
 
 def require_state(drive: Drive) -> Stream:

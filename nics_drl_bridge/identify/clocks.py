@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError
@@ -17,6 +16,8 @@ from nics_drl_bridge.identify.statistics import (
     CERTAIN,
     compute_unexplained,
     estimate_standard_errors,
+    estimate_uncertainty,
+    minimise,
 )
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot import taylor
@@ -38,11 +39,6 @@ BOUNDS = (
     (-0.5, np.log(0.005)),
     (0.5, np.log(2.0)),
 )
-# scale of both, relative step of differences, and termination of their refinement
-SCALE = 0.1
-DIFFERENCE = 1e-4
-TOLERANCE = 1e-7
-MAX_STEPS = 40
 MAX_ROWS = 2000
 FEW_ROWS = 1000
 EXACT = 1e-6
@@ -189,22 +185,13 @@ def _search(
     low, high = (
         np.append(delay + reach, np.full(len(lags), limit)) for reach, limit in BOUNDS
     )
-    # The search is for z = 1, since steps of differences are relative.
-    solution = scipy.optimize.least_squares(
-        lambda z: residual(start + (z - 1.0) * SCALE),
-        np.ones(len(start)),
-        bounds=((low - start) / SCALE + 1.0, (high - start) / SCALE + 1.0),
-        diff_step=DIFFERENCE,
-        xtol=TOLERANCE,
-        ftol=TOLERANCE,
-        max_nfev=MAX_STEPS,
+    theta, jacobian, rest = minimise(
+        residual, start, np.full(len(start), 0.1), (low, high)
     )
-    theta = start + (solution.x - 1.0) * SCALE
-    rest = solution.fun
     if float((rest**2).sum()) >= cost:
         theta = start
         rest = residual(start)
-    sigma = estimate_standard_errors(solution.jac / SCALE, rest)
+    sigma = estimate_uncertainty(jacobian, rest)
     tau = np.exp(theta[1:])
     explained = 1.0 - float((rest**2).mean())
     return DelayEstimate(

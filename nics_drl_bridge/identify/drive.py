@@ -31,10 +31,6 @@ NEGLIGIBLE = 1e-6  # m, rad
 REST_SAMPLES = 12
 REST_DRIFT = 3.0  # standard errors at rest; straight motion shows at least 4
 SLOPE_NOISE = 0.05
-WIDTHS_S = (0.07, 0.1, 0.15, 0.2)  # half-widths of the parabolas that give the twist
-# fraction of the usual speed, and turn rate, that the noise of a twist may reach
-NOISE = 0.02
-SAMPLES = 2.5  # minimum number of samples in half a width
 MAX_SPAN_S = 0.2
 MAX_GAP_S = 0.25
 
@@ -155,23 +151,6 @@ class Drive:
             heading_noise / max(SLOPE_NOISE * turn, 1e-9),
         )
         return int(np.clip(np.ceil(needed_s / dt), 1, longest))
-
-    @cached_property
-    def half_width_s(self) -> float:
-        """Half-width for smoothing poses [s]: the shortest that reduces their noise enough."""
-        t = self.dated.t
-        pose = unwrap_headings(self.dated.values)
-        span = float(t[-1] - t[0])
-        every = span / max(len(t) - 1, 1)
-        speed = np.hypot(*np.diff(pose[:, :2], axis=0).T).sum() / span
-        turn = np.abs(np.diff(pose[:, 2])).sum() / span
-        position, heading = self.pose_noise or (0.0, 0.0)
-        for width in WIDTHS_S:
-            gain = np.sqrt(12.0 * every / (2.0 * width)) / (2.0 * width)
-            is_calm = gain * heading <= NOISE * max(turn, speed)
-            if is_calm and gain * position <= NOISE * speed:
-                break
-        return float(max(width, SAMPLES * every))
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from nics_drl_bridge.identify import clocks, selection
-from nics_drl_bridge.identify.calibration import Calibration, align
+from nics_drl_bridge.identify import clocks, hypotheses
+from nics_drl_bridge.identify.calibration import Calibration, align, resample_motion
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import Fit, Regression
 from nics_drl_bridge.identify.mounting import Mounting
@@ -51,9 +51,9 @@ class Findings:
     # all terms (Eq. 1), from `fit_terms`
     regression: Regression | None = None
     # the textbook of a noisy drive and its effects, from which models depart, from `fit_terms`
-    base: selection.Base | None = None
+    base: hypotheses.Base | None = None
     # of orders, cross-validated within the training part, from `fit_terms`
-    trials: tuple[selection.Trial, ...] = ()
+    trials: tuple[hypotheses.Trial, ...] = ()
     # the pruned fit (Eq. 2), from `prune_terms`; of a noisy drive from `fit_terms`
     pruned_fit: Fit | None = None
     # from `prune_terms`; then from `refine_model` and `complete_model`
@@ -120,4 +120,6 @@ def require_model(findings: Findings) -> TaylorModel:
 
 def resample_drive(drive: Drive, findings: Findings) -> Samples:
     """Resamples a part of the drive on one time axis, by the calibration found so far."""
-    return align(drive, findings.calibration, findings.motion_width_s)
+    if findings.motion_width_s is None:
+        return align(drive, findings.calibration)
+    return resample_motion(drive, findings.calibration, findings.motion_width_s)

@@ -315,10 +315,10 @@ ORDER = 2
 TWIST_ROWS = slice(3)  # rows of dQ/dt: vx, vy, wz; the rates of the states follow
 # Standardised coefficients below this fraction of the largest rate are rounding errors.
 ROUNDING = 1e-9
+LEAST_RATE = 1e-9  # that rate is at least so large [unit of the rate]
 # A row is one step after the previous one if it is within this fraction of a step, and this time.
 STEP_TOLERANCE = 1e-3
 STEP_TOLERANCE_S = 1e-6
-LEAST_RATE = 1e-9  # that rate is at least so large [unit of the rate]
 
 
 def parse_alpha(text: str) -> Alpha:
@@ -383,62 +383,25 @@ class Regression:
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted model and its goodness of fit, which is computed when it is asked for.
+    """A fitted model and its goodness of fit.
 
     Attributes:
-        model: the pruned model, maybe with standard errors.
+        model: the pruned model, with standard errors.
         regression: on all features.
+        rmse: (D,) root mean square residual of dQ/dt without outliers, in units of dQ/dt.
+        r2: (D,) fraction of the variance that the model explains.
         alpha: threshold used for pruning, or `auto`.
+        outliers: (D,) fraction of the rows left out, as implausible or as outliers.
+        condition: (D,) condition number of the kept standardised features.
     """
 
     model: TaylorModel
     regression: Regression
+    rmse: Array
+    r2: Array
     alpha: Alpha
-
-    @cached_property
-    def rate_errors(self) -> tuple[Array, Array]:
-        """RMSE (D,) of dQ/dt and R2 (D,), the share of its variance that the model explains.
-
-        Neither counts outliers.
-        """
-        samples = self.regression.samples
-        rmse, r2 = statistics.measure_rate_errors(self.model, samples)
-        for d in self.regression.moving:
-            inside = self.regression.inliers[d]
-            if not inside.all():
-                errors = statistics.measure_rate_errors(
-                    self.model, samples.rows(inside)
-                )
-                rmse[d], r2[d] = (values[d] for values in errors)
-        return rmse, r2
-
-    @property
-    def rmse(self) -> Array:
-        """RMSE (D,) of dQ/dt without outliers."""
-        return self.rate_errors[0]
-
-    @property
-    def r2(self) -> Array:
-        """Fraction (D,) of the variance of dQ/dt that the model explains."""
-        return self.rate_errors[1]
-
-    @property
-    def outliers(self) -> Array:
-        """Fraction (D,) of the rows left out, as implausible or as outliers."""
-        regression = self.regression
-        kept = (1.0 - regression.left_out) * regression.inliers.mean(axis=1)
-        return np.asarray(1.0 - kept)
-
-    @cached_property
-    def condition(self) -> Array:
-        """Condition number (D,) of the kept standardised features."""
-        conditions = np.ones(len(self.model.dofs))
-        for d in self.regression.moving:
-            powers = self.model.powers[self.model.coefficients[d] != 0.0]
-            x = self.regression.samples.x[self.regression.inliers[d]]
-            features = taylor.evaluate(x, powers)
-            conditions[d] = statistics.compute_condition(features)
-        return conditions
+    outliers: Array
+    condition: Array
 
     @cached_property
     @np.errstate(over="ignore", invalid="ignore")
@@ -614,30 +577,63 @@ def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.boo
     return np.isin(np.arange(len(beta)), kept)
 
 
-def prune_and_refit(
-    regression: Regression, spec: RobotSpec, alpha: Alpha, with_errors: bool = True
-) -> Fit:
+def prune_and_refit(regression: Regression, spec: RobotSpec, alpha: Alpha) -> Fit:
     """Prunes a regression (Eq. 2) and fits the terms that are kept again (Eq. 1).
-
-    Standard errors take most of the time.
 
     With `auto` in place of a threshold, terms are taken in the order of their size, the fewest
     whose cross-validated error is within one standard error of the minimum.
     """
-    samples = regression.samples
+    coefficients, errors = _refit_dofs(regression, spec, alpha)
+    conditions = np.ones(len(coefficients))
+    for d in regression.moving:
+        kept = coefficients[d] != 0.0
+        features, _ = regression.rows(d)
+        conditions[d] = statistics.compute_condition(features[:, kept])
+        if np.isnan(errors[d, kept]).any():
+            errors[d, kept] = _estimate_errors(regression, d, coefficients[d], kept)
+    model = _make_model(regression, spec, coefficients, errors)
+    rmse, r2 = _measure_fit(regression, model)
+    outliers = 1.0 - (1.0 - regression.left_out) * regression.inliers.mean(axis=1)
+    return Fit(model, regression, rmse, r2, alpha, outliers, conditions)
+
+
+def fit_kept_terms(
+    regression: Regression, spec: RobotSpec, alpha: Alpha
+) -> TaylorModel:
+    """Does the same as `prune_and_refit`, without errors, which take most of the time."""
+    coefficients, _ = _refit_dofs(regression, spec, alpha)
+    return _make_model(regression, spec, coefficients)
+
+
+def _refit_dofs(
+    regression: Regression, spec: RobotSpec, alpha: Alpha
+) -> tuple[Array, Array]:
+    """Returns coefficients (D, K) of the kept terms; errors of those by instruments, else NaN."""
     coefficients = np.zeros(regression.beta.shape)
-    errors = np.zeros(regression.beta.shape)
-    needs_instruments = states_are_noisy(samples, spec)
+    errors = np.full(regression.beta.shape, np.nan)
+    needs_instruments = states_are_noisy(regression.samples, spec)
     for d in regression.moving:
         kept = _select_terms(regression, d, spec, alpha)
-        coefficients[d], errors[d] = _refit_terms(regression, d, kept, with_errors)
+        if kept.any():
+            coefficients[d, kept] = _refit_terms(regression, d, kept)
         if needs_instruments and d >= TWIST_ROWS.stop:
             by_instruments = _fit_by_instruments(
                 regression, d, coefficients[d], len(spec.state)
             )
             if by_instruments is not None:
-                terms = coefficients[d] != 0.0
+                terms = np.flatnonzero(coefficients[d])
                 coefficients[d, terms], errors[d, terms] = by_instruments
+    return coefficients, errors
+
+
+def _make_model(
+    regression: Regression,
+    spec: RobotSpec,
+    coefficients: Array,
+    errors: Array | None = None,
+) -> TaylorModel:
+    """Returns the model of the terms that have coefficients (D, K), maybe with errors (D, K)."""
+    samples = regression.samples
     used = coefficients.any(axis=0)
     model = TaylorModel(
         spec.variable_names,
@@ -649,28 +645,42 @@ def prune_and_refit(
         samples.x.min(axis=0),
         samples.x.max(axis=0),
     )
-    if with_errors:
-        model = replace(model, std_errors=errors[:, used])
-    return Fit(model, regression, alpha)
+    if errors is None:
+        return model
+    known = np.where(model.coefficients != 0.0, errors[:, used], 0.0)
+    return replace(model, std_errors=known)
 
 
-def _refit_terms(
-    regression: Regression, d: int, kept: NDArray[np.bool_], with_errors: bool
-) -> tuple[Array, Array]:
-    """Returns coefficients (K,) of the terms that are kept (Eq. 1), maybe with their errors."""
+def _measure_fit(regression: Regression, model: TaylorModel) -> tuple[Array, Array]:
+    """Returns RMSE (D,) and R2 (D,) of a model's rates, each without its outliers."""
+    samples = regression.samples
+    rmse, r2 = statistics.measure_rate_errors(model, samples)
+    for d in regression.moving:
+        inside = regression.inliers[d]
+        if not inside.all():
+            errors, shares = statistics.measure_rate_errors(model, samples.rows(inside))
+            rmse[d] = errors[d]
+            r2[d] = shares[d]
+    return rmse, r2
+
+
+def _refit_terms(regression: Regression, d: int, kept: NDArray[np.bool_]) -> Array:
+    """Returns the coefficients of the terms (K,) that are kept (Eq. 1)."""
     features, target = regression.rows(d)
     spreads = _spreads(features[:, kept])
+    beta = np.linalg.lstsq(features[:, kept] / spreads, target, rcond=None)[0]
+    return np.asarray(beta / spreads)
+
+
+def _estimate_errors(
+    regression: Regression, d: int, coefficients: Array, kept: NDArray[np.bool_]
+) -> Array:
+    """Returns the standard errors of the coefficients (K,) that are kept."""
+    features, target = regression.rows(d)
+    residual = target - features @ coefficients
+    spreads = _spreads(features[:, kept])
     standardised = features[:, kept] / spreads
-    beta = np.linalg.lstsq(standardised, target, rcond=None)[0]
-    coefficients = np.zeros(len(kept))
-    coefficients[kept] = beta / spreads
-    errors = np.zeros(len(kept))
-    if with_errors:
-        residual = target - standardised @ beta
-        errors[kept] = (
-            statistics.estimate_standard_errors(standardised, residual) / spreads
-        )
-    return coefficients, errors
+    return statistics.estimate_standard_errors(standardised, residual) / spreads
 
 
 def _select_terms(

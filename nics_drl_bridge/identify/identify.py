@@ -21,26 +21,18 @@ from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.identify import clocks as timings
 from nics_drl_bridge.identify import fit as fitting
 from nics_drl_bridge.identify import judgement as judging
-from nics_drl_bridge.identify import open_loop, selection, verdict
+from nics_drl_bridge.identify import open_loop, verdict
 from nics_drl_bridge.identify.calibration import (
     Calibration,
     Response,
     add_motion,
     align,
+    choose_half_width,
     has_motion_as_state,
     make_motion_grid,
     make_surrogate,
 )
 from nics_drl_bridge.identify.drive import Drive, Settings
-from nics_drl_bridge.identify.effects import (
-    CLEAR,
-    Evidence,
-    drop_unreached_ends,
-    find_input_curve,
-    find_latency,
-    find_likely_delay,
-    make_curves,
-)
 from nics_drl_bridge.identify.findings import (
     Findings,
     require,
@@ -49,6 +41,13 @@ from nics_drl_bridge.identify.findings import (
     require_samples,
     resample_drive,
 )
+from nics_drl_bridge.identify.forms import (
+    CLEAR,
+    drop_unreached_ends,
+    find_input_curve,
+    find_likely_delay,
+    list_driving_commands,
+)
 from nics_drl_bridge.identify.judgement import (
     estimate_bands,
     fit_textbook,
@@ -56,6 +55,10 @@ from nics_drl_bridge.identify.judgement import (
 )
 from nics_drl_bridge.identify.mounting import apply_mounting, estimate_mounting
 from nics_drl_bridge.identify.noise import add_motion_noise, measure_sensor_noise
+from nics_drl_bridge.identify.prediction_fit import (
+    fit_by_predictions,
+    refine_by_predictions,
+)
 from nics_drl_bridge.identify.repair import (
     check_axes,
     check_commands,
@@ -64,13 +67,6 @@ from nics_drl_bridge.identify.repair import (
     check_units,
     correct_heading_by_gyro,
     repair_rows,
-)
-from nics_drl_bridge.identify.shooting import Predictive
-from nics_drl_bridge.identify.terms import (
-    Kind,
-    Library,
-    drop_unused_terms,
-    share_effects,
 )
 from nics_drl_bridge.identify.textbook_model import (
     add_actuator_state,
@@ -83,13 +79,11 @@ from nics_drl_bridge.identify.textbook_model import (
 from nics_drl_bridge.identify.yardstick import Yardstick, fit_yardstick
 from nics_drl_bridge.recording.joining import LEARNT_SHARE, join
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
-from nics_drl_bridge.robot.kernels import MAX_ORDER
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import HorizonErrors, TaylorModel
 from nics_drl_bridge.threads import one_blas_thread
 
-SHORT_S = 5.0  # a shorter drive can't tell the third and fourth order of a textbook
 Stage = Callable[[Drive, Findings], Findings]
 
 
@@ -237,19 +231,28 @@ class Identified:
             ),
         ]
         if unfit:
-            ratings.append(judging.Assessment(judging.Verdict.DO_NOT_TRAIN))
+            ratings.append(judging.Assessment(judging.Verdict.DO_NOT_TRAIN, ()))
         doubtful = any(isinstance(note, verdict.Doubt) for note in self.notes)
         doubtful |= any(
             judging.list_doubts_of_commands(self.judgement, self.calibration)
         )
         if self.model.assumed or doubtful:
-            ratings.append(judging.Assessment(judging.Verdict.WITH_CARE))
+            ratings.append(judging.Assessment(judging.Verdict.WITH_CARE, ()))
         return judging.combine_ratings(ratings)
 
     @property
     def verdict(self) -> judging.Verdict:
         """What the model is suitable for, as one of three verdicts."""
         return self.assessment.verdict
+
+    @property
+    def dead_zone(self) -> float:
+        """Maximum of the driving command at which the robot stays at rest; 0 if none."""
+        spec = self.drive.spec
+        driving = set(list_driving_commands(spec))
+        if not driving:  # no textbook says what each command moves
+            driving = {c.name for c in spec.command if not c.turns and c.unit != "rad"}
+        return _find_dead_zone(self.model, driving)
 
     @property
     def alpha(self) -> fitting.Alpha:
@@ -277,6 +280,24 @@ def _make_result(trial: Findings, final: Findings) -> Identified:
         findings=trial,
         notes=final.notes,
     )
+
+
+def _find_dead_zone(model: TaylorModel, driving: set[str]) -> float:
+    """Returns the largest command of those that drive at which no state starts to move.
+
+    A state with dry friction starts when the effect of its command exceeds the friction.
+    """
+    dead = {c.command: c.dead for c in model.inputs if c.command in driving}
+    zones = [0.0, *dead.values()]
+    for i, place in enumerate(model.state_size + model.drivers):
+        if model.variables[place] not in driving:
+            continue
+        alone = np.arange(len(model.variables)) == place
+        gain = abs(model.coefficients[3 + i, (model.powers == alone).all(axis=1)].sum())
+        if model.friction[i] * gain > 0.0:
+            zone = dead.get(model.variables[place], 0.0)
+            zones.append(zone + float(model.friction[i] / gain))
+    return max(zones)
 
 
 def repair_drive(drive: Drive, findings: Findings) -> Findings:
@@ -367,7 +388,7 @@ def derive_motion(drive: Drive, findings: Findings) -> Findings:
     if not has_motion_as_state(drive.spec, drive.recording):
         return findings
     calibration = findings.calibration
-    width = findings.training.half_width_s
+    width = choose_half_width(findings.training)
     parts = []
     for part in (findings.training, findings.whole):
         grid = make_motion_grid(part, calibration, drive.settings.control_period_s)
@@ -380,21 +401,22 @@ def find_input_curves(drive: Drive, findings: Findings) -> Findings:
     """Finds the latency, and the dead zones and saturation of commands, that explain a motion."""
     if findings.motion_width_s is None:
         return findings
+    training = findings.training
     findings = _with_likely_latency(findings)
-    samples = resample_drive(findings.training, findings)
-    found = [
-        find_input_curve(samples, drive.spec, place)
-        for place in range(len(drive.spec.command))
-    ]
-    curves = [candidate for candidate in found if candidate is not None]
+    samples = resample_drive(training, findings)
+    curves = []
+    clear = []
+    for place in range(len(drive.spec.command)):
+        candidate = find_input_curve(samples, drive.spec, place)
+        if candidate is None:
+            continue
+        curves.append(candidate.curve)
+        if candidate.gain >= CLEAR:
+            clear.append(candidate.curve)
     if not curves:
         return findings
-    inputs = tuple(found.curve for found in curves)
-    findings = replace(
-        findings,
-        calibration=replace(findings.calibration, inputs=inputs),
-        clear_curves=tuple(found.curve for found in curves if found.gain >= CLEAR),
-    )
+    calibration = replace(findings.calibration, inputs=tuple(curves))
+    findings = replace(findings, calibration=calibration, clear_curves=tuple(clear))
     return _with_likely_latency(findings)  # the curves may hide a part of it
 
 
@@ -412,75 +434,19 @@ def fit_terms(drive: Drive, findings: Findings) -> Findings:
 
     Unless the drive is exact, predictions choose these terms and effects of motors beside them.
     """
+    calibration = findings.calibration
+    if not calibration.is_exact:
+        return fit_by_predictions(drive, findings)
+    settings = drive.settings
+    samples = align(findings.training, calibration)
+    order = fitting.ORDER if settings.order == "auto" else settings.order
     try:
-        if findings.calibration.is_exact:
-            findings = _fit_exactly(drive, findings)
-        else:
-            findings = _fit_by_predictions(drive, findings)
+        regression = fitting.regress(samples, drive.spec, order)
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
-    regression = require(findings.regression, "the fit of all terms", "fit_terms")
-    if drive.settings.strict:
+    if settings.strict:
         verdict.refuse_unexcited(regression.excitation, drive.spec)
-    return findings
-
-
-def _fit_exactly(drive: Drive, findings: Findings) -> Findings:
-    order = drive.settings.order
-    samples = align(findings.training, findings.calibration)
-    regression = fitting.regress(
-        samples, drive.spec, fitting.ORDER if order == "auto" else order
-    )
     return replace(findings, samples=samples, regression=regression)
-
-
-def _fit_by_predictions(drive: Drive, findings: Findings) -> Findings:
-    """Fits the textbook with the effects, and the order of terms, that predict best.
-
-    A refit reuses these choices.
-    """
-    training = findings.training
-    order = drive.settings.order
-    library = make_library(drive, findings)
-    samples = resample_drive(training, findings)
-    evidence = Evidence(training, findings.calibration, samples, library)
-    if findings.base is None:
-        base = selection.fit_base(evidence, findings.clear_curves)
-    else:
-        base = selection.refit_base(evidence, findings.base)
-    asked = selection.list_hypotheses(order, library)
-    trials = findings.trials or base.draft.cross_validate(asked)
-    curves = make_curves(drive.spec, base.found.named)
-    if library.kind is Kind.MOTION:
-        calibration = replace(findings.calibration, inputs=curves)
-        findings = replace(findings, calibration=calibration)
-        samples = resample_drive(training, findings)
-    else:
-        samples = base.draft.select(None)
-    best = selection.choose_trial(trials, order)
-    fit = library.fit(samples, best.order or library.order, with_errors=True)
-    return replace(
-        findings,
-        samples=samples,
-        regression=fit.regression,
-        pruned_fit=fit,
-        model=replace(fit.model, inputs=curves),
-        trials=trials,
-        base=base,
-    )
-
-
-def make_library(drive: Drive, findings: Findings) -> Library:
-    """Returns the terms that the model of a drive may have."""
-    order = drive.settings.order
-    if not drive.spec.state or findings.motion_width_s is not None:
-        return Library(drive.spec, Kind.MOTION, True, 1.0, selection.BASE_ORDER)
-    kind = Kind.FOLLOWER if drive.recording.state is None else Kind.MEASURED
-    centred = "lever_arm_y_m" in findings.calibration.uncertainty
-    if order == "auto":
-        is_short = findings.training.duration_s < SHORT_S
-        order = fitting.ORDER if kind is Kind.MEASURED or is_short else MAX_ORDER
-    return Library(drive.spec, kind, centred, drive.settings.alpha, order)
 
 
 def prune_terms(drive: Drive, findings: Findings) -> Findings:
@@ -493,86 +459,10 @@ def prune_terms(drive: Drive, findings: Findings) -> Findings:
 
 
 def refine_model(drive: Drive, findings: Findings) -> Findings:
-    """Adjusts terms, delays, lags and mounting to predictions over seconds, then prunes (Eq. 2).
-
-    An exact drive is left as it is, and the terms of a state that is the motion are not pruned.
-    """
+    """Adjusts model and calibration to predictions over seconds, unless the drive is exact."""
     if findings.calibration.is_exact:
         return findings
-    base = require(findings.base, "the base", "fit_terms")
-    terms = require_fit(findings).model
-    best = selection.choose_trial(findings.trials, drive.settings.order)
-    calibration = findings.calibration
-    draft = base.draft
-    found, has_order = _search_model(base, terms, best)
-    if draft.problem.is_mounted:
-        certain = selection.drop_doubtful_mounting(draft, calibration, found)
-        if certain is not None:
-            errors = selection.add_predicted_mounting(calibration, found).uncertainty
-            calibration = replace(calibration, uncertainty=errors)
-            draft = certain
-            found, has_order = _search_model(replace(base, draft=draft), terms, best)
-    is_motion = draft.library.kind is Kind.MOTION
-    if not is_motion:
-        found = draft.prune(found, drive.settings.alpha)
-    calibration = draft.calibrate(found, calibration)
-    base = replace(base, draft=draft.start_calibrated(found, calibration))
-    sums: tuple[str, ...] = ()
-    if is_motion:
-        calibration, sums = _separate_lags(base, calibration, drive.spec)
-    else:
-        calibration = draft.add_sums(calibration, found)
-    model = draft.add_errors(found, terms)
-    model = replace(model, inputs=calibration.inputs)
-    model = share_effects(model, drive.spec, require_samples(findings))
-    return replace(
-        findings,
-        calibration=calibration,
-        model=drop_unused_terms(model),
-        base=base,
-        refinement=(
-            verdict.describe_refinement(draft.problem.longest_horizon_s),
-            *sums,
-            *selection.describe_effects(base, findings.trials, drive.settings.order),
-            *verdict.list_unused_options(drive.settings, is_motion, has_order),
-        ),
-    )
-
-
-def _search_model(
-    base: selection.Base, terms: TaylorModel, best: selection.Trial
-) -> tuple[Predictive, bool]:
-    """Searches for the best-predicting model of the best order, from the fitted textbook.
-
-    The textbook's terms alone are kept if the search for more, from `terms` fitted by least
-    squares, diverges. Also returns whether the model has the terms of the chosen order.
-    """
-    draft = base.draft
-    if best.pull:
-        refined = draft.refine(base.found.model, terms, pull=best.pull)
-        errors = (
-            draft.problem.measure_mean_error(found.model, found.parameters.start)
-            for found in (refined, base.found)
-        )
-        if not verdict.is_worse(*errors):
-            return refined, True
-    return draft.fit_base(other=base.found.model), best.pull == 0.0
-
-
-def _separate_lags(
-    base: selection.Base, calibration: Calibration, spec: RobotSpec
-) -> tuple[Calibration, tuple[str, ...]]:
-    """Drops the latency's error where lags hide it; returns a sentence on their sums instead."""
-    named = base.found.named
-    model = replace(base.found.model, inputs=make_curves(spec, named))
-    lags = selection.find_lags(model, spec)
-    if not lags:
-        return calibration, ()
-    latency = calibration.command_latency_s
-    sums = selection.describe_lag_sums(latency, lags, find_latency(named))
-    errors = dict(calibration.uncertainty)
-    errors.pop("command_latency_s", None)
-    return replace(calibration, uncertainty=errors), (sums,)
+    return refine_by_predictions(drive, findings)
 
 
 def complete_model(drive: Drive, findings: Findings) -> Findings:
@@ -598,11 +488,7 @@ def judge_model(drive: Drive, findings: Findings) -> Findings:
     unseen: Samples | None = samples.rows(samples.t > held_out_from)
     if unseen is not None and len(unseen.t) < verdict.MIN_ROWS:
         unseen = None
-    held_out = None
-    with suppress(RecordingError):  # the rest is too short
-        held_out = open_loop.measure_open_loop_error(
-            model, calibration, whole, until, whole.duration_s
-        )
+    held_out = verdict.try_model(model, calibration, whole, until)
     yardstick = findings.yardstick or fit_textbook(whole, calibration)
     bands = _find_bands(drive, findings)
     judgement = judge_predictions(model, calibration, whole, bands, yardstick)

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify import selection, shooting
+from nics_drl_bridge.identify import hypotheses, shooting
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.effects import Evidence
+from nics_drl_bridge.identify.forms import Evidence, make_prediction_problem
 from nics_drl_bridge.identify.open_loop import (
     SPACING_S,
     Windows,
@@ -24,6 +24,7 @@ from nics_drl_bridge.identify.open_loop import (
 )
 from nics_drl_bridge.identify.yardstick import (
     Yardstick,
+    estimate_twists_at,
     fit_yardstick,
     predict_kept_twist,
 )
@@ -98,7 +99,7 @@ class Assessment:
 
     verdict: Verdict
     # a sentence for each threshold of a good model that this one misses
-    reasons: tuple[str, ...] = ()
+    reasons: tuple[str, ...]
 
 
 def select_usual_horizon(judgement: tuple[HorizonErrors, ...]) -> list[HorizonErrors]:
@@ -159,7 +160,7 @@ def describe_shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
     """Yields the yardsticks that a model does not beat after 5 s, or at the longest horizon."""
     for at in select_usual_horizon(judgement):
         yield from describe_shortfall_of_textbook(at)
-        yield from (finding for _, finding in _compare_with_twist(at))
+        yield from describe_shortfall_of_twist(at)
 
 
 def describe_shortfall_of_textbook(at: HorizonErrors) -> Iterator[str]:
@@ -171,21 +172,26 @@ def describe_shortfall_of_textbook(at: HorizonErrors) -> Iterator[str]:
         yield f"{_describe_errors('the fitted textbook', at, at.textbook)}."
 
 
-def _compare_with_twist(at: HorizonErrors) -> Iterator[tuple[Outcome, str]]:
+def describe_shortfall_of_twist(at: HorizonErrors) -> Iterator[str]:
     """Yields a sentence if predictions are no better than those of a constant twist."""
     outcome = compare(at.model, at.kept_twist, at.kept_twist_noise_m, at.path_m)
     finding = _describe_errors("a constant twist", at, at.kept_twist)
+    if outcome is Outcome.WORSE:
+        yield f"{finding}."
     if outcome is Outcome.ALIKE:
-        why = "too close to distinguish: the commands explain little of this drive"
-        finding = f"{finding}, {why}"
-    if outcome is not Outcome.BETTER:
-        yield outcome, f"{finding}."
+        yield f"{finding}, too close to distinguish: the commands explain little of this drive."
 
 
 def _describe_errors(name: str, at: HorizonErrors, errors: EndErrors) -> str:
     off = f"end {at.model.position_m:.3g} m off after {at.horizon_s:g} s"
     finding = f"The model does not beat {name}: on unseen data its predictions {off}"
     return f"{finding}, those of {name} {errors.position_m:.3g} m"
+
+
+def compute_relative_error(at: HorizonErrors, radius: float) -> float:
+    """Returns an error as a fraction of the path, or of the robot's radius [m] if longer."""
+    # A robot that turns in place has no path.
+    return at.model.position_m / max(at.path_m, radius, 1e-9)
 
 
 def rate(
@@ -197,18 +203,23 @@ def rate(
     """
     judged = select_usual_horizon(judgement)
     if not judged:
-        return Assessment(Verdict.DO_NOT_TRAIN)
+        return Assessment(Verdict.DO_NOT_TRAIN, ())
     (at,) = judged
-    faults = list(_list_faults(at, radius))
+    ratings = [
+        _rate_error(at, radius),
+        _rate_band(at),
+        _rate_beside_twist(at),
+        _rate_beside_standing(at, radius),
+    ]
     if not textbook and loses_to_textbook(judgement):
-        (finding,) = describe_shortfall_of_textbook(at)
-        faults.append((Verdict.DO_NOT_TRAIN, finding))
-    return combine_ratings(Assessment(word, (reason,)) for word, reason in faults)
+        reasons = tuple(describe_shortfall_of_textbook(at))
+        ratings.append(Assessment(Verdict.DO_NOT_TRAIN, reasons))
+    return combine_ratings(ratings)
 
 
 def combine_ratings(ratings: Iterable[Assessment]) -> Assessment:
-    """Returns the least favourable verdict, with the reasons of all; good without any."""
-    verdicts = [Verdict.GOOD]
+    """Returns the least favourable verdict, with the reasons of all."""
+    verdicts = []
     reasons: list[str] = []
     for rating in ratings:
         verdicts.append(rating.verdict)
@@ -220,45 +231,58 @@ def rate_unseen(gap_s: float, duration_s: float) -> Assessment:
     """Rates the time without a pose [s] relative to the duration of a drive [s]."""
     share = gap_s / max(duration_s, 1e-9)
     if share <= THRESHOLDS.most_unseen:
-        return Assessment(Verdict.GOOD)
+        return Assessment(Verdict.GOOD, ())
     finding = f"The pose is missing for {gap_s:.1f} s, {share:.0%} of the drive"
     limit = f"beyond {THRESHOLDS.most_unseen:.0%} too much of the motion is missing"
     return Assessment(Verdict.WITH_CARE, (f"{finding}: {limit}.",))
 
 
-def _list_faults(at: HorizonErrors, radius: float) -> Iterator[tuple[Verdict, str]]:
-    """Yields a verdict and a reason for each threshold of a good model that this one misses."""
+def _rate_error(at: HorizonErrors, radius: float) -> Assessment:
     limits = THRESHOLDS
-    # A robot that turns in place has no path.
-    share = at.model.position_m / max(at.path_m, radius, 1e-9)
-    far = f"After {at.horizon_s:g} s its predictions of unseen data end {share:.1%} of their path"
+    share = compute_relative_error(at, radius)
+    if share <= limits.good_error:
+        return Assessment(Verdict.GOOD, ())
     if not np.isfinite(share):
-        yield Verdict.DO_NOT_TRAIN, "Its predictions diverge."
-    elif share > limits.worst_error:
-        most = f"more than the {limits.worst_error:.0%} beyond which nothing is trained"
-        yield Verdict.DO_NOT_TRAIN, f"{far} away, {most}."
-    elif share > limits.good_error:
-        most = f"those of a good model within {limits.good_error:.0%}"
-        yield Verdict.WITH_CARE, f"{far} away, {most}."
-    if at.coverage is not None and at.coverage < limits.good_coverage:
-        word = Verdict.WITH_CARE
-        limit = limits.good_coverage
-        if at.coverage < limits.worst_coverage:
-            word = Verdict.DO_NOT_TRAIN
-            limit = limits.worst_coverage
-        finding = f"The band that should hold 95 % of the ends holds {at.coverage:.0%}"
-        why = "errors are larger than the first part shows"
-        yield word, f"{finding} of the unseen ones, less than {limit:.0%}: {why}."
-    for outcome, finding in _compare_with_twist(at):
-        alike = outcome is Outcome.ALIKE
-        yield Verdict.WITH_CARE if alike else Verdict.DO_NOT_TRAIN, finding
-    # For a robot that never moves, noise alone makes up a path.
-    if at.standing is not None and at.path_m > radius:
-        outcome = compare(at.model, at.standing, at.standing_noise_m, 0.0)
-        if outcome is not Outcome.BETTER:
-            finding = _describe_errors("a robot that never moves", at, at.standing)
-            why = "the pose does not follow these commands"
-            yield Verdict.DO_NOT_TRAIN, f"{finding}: {why}."
+        return Assessment(Verdict.DO_NOT_TRAIN, ("Its predictions diverge.",))
+    far = f"After {at.horizon_s:g} s its predictions of unseen data end {share:.1%} of their path"
+    if share <= limits.worst_error:
+        reason = f"{far} away, those of a good model within {limits.good_error:.0%}."
+        return Assessment(Verdict.WITH_CARE, (reason,))
+    reason = f"{far} away, more than the {limits.worst_error:.0%} beyond which nothing is trained."
+    return Assessment(Verdict.DO_NOT_TRAIN, (reason,))
+
+
+def _rate_band(at: HorizonErrors) -> Assessment:
+    limits = THRESHOLDS
+    coverage = at.coverage
+    if coverage is None or coverage >= limits.good_coverage:
+        return Assessment(Verdict.GOOD, ())
+    low = coverage < limits.worst_coverage
+    limit = limits.worst_coverage if low else limits.good_coverage
+    finding = f"The band that should hold 95 % of the ends holds {coverage:.0%} of the unseen ones"
+    reason = f"{finding}, less than {limit:.0%}: errors are larger than the first part shows."
+    return Assessment(Verdict.DO_NOT_TRAIN if low else Verdict.WITH_CARE, (reason,))
+
+
+def _rate_beside_twist(at: HorizonErrors) -> Assessment:
+    outcome = compare(at.model, at.kept_twist, at.kept_twist_noise_m, at.path_m)
+    verdicts = {Outcome.BETTER: Verdict.GOOD, Outcome.ALIKE: Verdict.WITH_CARE}
+    return Assessment(
+        verdicts.get(outcome, Verdict.DO_NOT_TRAIN),
+        tuple(describe_shortfall_of_twist(at)),
+    )
+
+
+def _rate_beside_standing(at: HorizonErrors, radius: float) -> Assessment:
+    """Rates predictions against a robot that never moves, for which noise alone makes up a path."""
+    if at.standing is None or at.path_m <= radius:
+        return Assessment(Verdict.GOOD, ())
+    outcome = compare(at.model, at.standing, at.standing_noise_m, 0.0)
+    if outcome is Outcome.BETTER:
+        return Assessment(Verdict.GOOD, ())
+    finding = _describe_errors("a robot that never moves", at, at.standing)
+    reason = f"{finding}: the pose does not follow these commands."
+    return Assessment(Verdict.DO_NOT_TRAIN, (reason,))
 
 
 def list_doubts_of_commands(
@@ -282,7 +306,7 @@ def list_doubts_of_commands(
         )
 
 
-HORIZONS_S = (*selection.BANDS_S, 10.0)
+HORIZONS_S = (*hypotheses.BANDS_S, 10.0)
 FOLDS = 5
 # limit for the fits to all parts but one, which start from the fit to all parts
 EVALUATIONS = 8
@@ -322,12 +346,13 @@ def judge_predictions(
         if not len(chosen.start_t):
             break
         ends = predict(model, calibration, drive, chosen)
+        twist = estimate_twists_at(drive, chosen.start_t)
         yardsticks = {
-            "kept_twist": predict_kept_twist(drive, chosen),
+            "kept_twist": predict_kept_twist(drive, chosen, twist),
             "standing": chosen.start,
         }
         if textbook is not None:
-            yardsticks["textbook"] = textbook.predict(drive, chosen)
+            yardsticks["textbook"] = textbook.predict(drive, chosen, twist)
         figures: dict[str, Any] = {}
         for name, theirs in yardsticks.items():
             figures[name] = average_end_errors(theirs, chosen)
@@ -379,7 +404,7 @@ def estimate_bands(
     model: TaylorModel,
     calibration: Calibration,
     training: Drive,
-    derived: tuple[Samples, selection.Base] | None = None,
+    derived: tuple[Samples, hypotheses.Base] | None = None,
     fixed: bool = False,
 ) -> dict[float, float]:
     """Returns the distances [m] within which 95 % of predictions are expected to end, by horizon.
@@ -388,7 +413,7 @@ def estimate_bands(
     the samples of the training part, and the base that the model departed from. A
     `fixed` model is not adjusted, and predicts the whole part.
     """
-    errors: dict[float, list[Array]] = {h: [] for h in selection.BANDS_S}
+    errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
     folds = [(training, training)] if fixed else training.folds(FOLDS)
     for _, part in folds:
         adjusted = model, calibration
@@ -428,15 +453,16 @@ def _adjust_to_rows(
     calibration: Calibration,
     training: Drive,
     samples: Samples,
-    base: selection.Base,
+    base: hypotheses.Base,
     kept: NDArray[np.bool_],
 ) -> tuple[TaylorModel, Calibration]:
     """Adjusts a model, and its inputs, to the rows that are kept (T,)."""
-    evidence = Evidence(training, calibration, samples, base.draft.library)
-    draft = selection.Draft.of(evidence, base.draft.problem.parameters)
-    problem = replace(draft.problem, spacing_s=selection.SPACING_S)
+    draft = base.draft
+    evidence = Evidence(training, calibration, samples, draft.library)
+    problem = make_prediction_problem(evidence, draft.form, draft.problem.parameters)
+    problem = replace(problem, spacing_s=hypotheses.SPACING_S)
     free = draft.library.select_free(model)
-    pull = selection.PULLS[-1]
+    pull = hypotheses.PULLS[-1]
     fitted = shooting.fit_to_predictions(problem, model, free, kept, EVALUATIONS, pull)
-    calibration = draft.calibrate(fitted, calibration)
+    calibration = replace(draft, problem=problem).calibrate(fitted, calibration)
     return replace(fitted.model, inputs=calibration.inputs), calibration

@@ -5,6 +5,7 @@ serves states that follow commands, since `scipy.signal` takes a second to impor
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -18,10 +19,68 @@ from nics_drl_bridge.robot.kernels import (
     advance_state,
     get_bounds,
 )
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 # most windows that are predicted at a time, and how many vector instructions take at once
 LANES = 64
 VECTOR = 16
+# below this turn of a step the series of its sine and cosine are exact to the last digits [rad]
+SMALL_TURN = 0.1
+
+
+class TermIndex(NamedTuple):
+    """The used terms of a model, without their coefficients, in the order of their dofs."""
+
+    dof: NDArray[np.int64]  # (K,) degree of freedom of each term
+    factors: NDArray[np.int64]  # (K, order) as in `Terms`
+    degree: NDArray[np.int64]  # (K,)
+    free: NDArray[np.int64]  # (P,) places of the free ones
+
+
+@lru_cache(maxsize=16)  # searches change coefficients, not terms
+def _index_terms(
+    powers: bytes, used: bytes, free: bytes, shape: tuple[int, int]
+) -> TermIndex:
+    """Returns the index of the used ones (D, K) among terms, and the free ones (D, K) of these."""
+    is_used = np.frombuffer(used, np.bool_).reshape(shape)
+    is_free = np.frombuffer(free, np.bool_).reshape(shape)
+    dofs, columns = np.nonzero(is_used)
+    rows = np.frombuffer(powers, np.int64).reshape(shape[1], -1)[columns]
+    degree = rows.sum(axis=1)
+    variables = rows.shape[1]
+    factors = np.full((len(rows), max(1, int(degree.max(initial=1)))), variables)
+    for term, row in zip(factors, rows, strict=True):
+        term[: row.sum()] = np.repeat(np.arange(variables), row)
+    moving = np.flatnonzero(is_free[is_used])
+    return TermIndex(dofs.astype(np.int64), factors, degree, moving.astype(np.int64))
+
+
+def make_used_terms(
+    model: TaylorModel, used: NDArray[np.bool_], free: NDArray[np.bool_]
+) -> tuple[Terms, NDArray[np.int64]]:
+    """Returns the used ones (D, K) of a model's terms, and the indices of the free among them.
+
+    A term that is used may have a coefficient of 0. Commands are taken to be those in effect.
+    """
+    powers = model.powers.astype(np.int64).tobytes()
+    index = _index_terms(powers, used.tobytes(), free.tobytes(), used.shape)
+    low, high = model.state_box
+    terms = Terms(
+        dof=index.dof,
+        coefficient=model.coefficients[used],
+        factors=index.factors,
+        degree=index.degree,
+        low=low,
+        high=high,
+        fall=np.ascontiguousarray(model.limits[:, 0]),
+        rise=np.ascontiguousarray(model.limits[:, 1]),
+        friction=model.friction,
+        drag=model.drag,
+        curves=np.zeros((0, 4)),
+        extra_delays=np.zeros(0, dtype=np.int64),
+        emf=model.back_emf if model.back_emf.any() else np.zeros((0, 0)),
+    )
+    return terms, index.free
 
 
 class Shot(NamedTuple):
@@ -63,7 +122,8 @@ class Tangent(NamedTuple):
 def allocate_tangent(shot: Shot, terms: Terms, free: int) -> Tangent:
     """Allocates scratch memory for `shoot`."""
     windows, states = shot.state.shape
-    lanes = min(LANES, VECTOR * max(1, -(-windows // VECTOR)))
+    blocks = max(1, -(-windows // LANES))
+    lanes = VECTOR * max(1, -(-windows // (VECTOR * blocks)))
     depends = np.zeros((3 + states, states), dtype=np.bool_)
     for factors in terms.factors.T:
         by_state = factors < states
@@ -280,19 +340,27 @@ def _aim(ahead: Array, pose: Array, turn_rate: Array, dt: float) -> None:
     sine = pose[4]
     along = ahead[0]
     aside = ahead[1]
+    largest = 0.0
+    for lane in range(turn_rate.shape[0]):
+        largest = max(largest, abs(turn_rate[lane]))
     for lane in range(turn_rate.shape[0]):
         turn = turn_rate[lane] * dt
         square = turn * turn
-        # the series of the sine and of the versine, over the turn
-        sinc = 1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0))
-        sinc = 1.0 - square / 6.0 * sinc
-        cosc = 1.0 - square / 30.0 * (1.0 - square / 56.0 * (1.0 - square / 90.0))
-        cosc = turn * (0.5 - square / 24.0 * cosc)
+        sinc = 1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square / 5040.0))
+        cosc = turn * (0.5 - square * (1.0 / 24.0 - square / 720.0))
         along[lane] = dt * (sinc * cosine[lane] - cosc * sine[lane])
         aside[lane] = dt * (sinc * sine[lane] + cosc * cosine[lane])
     for lane in range(turn_rate.shape[0]):
         cosine[lane] -= turn_rate[lane] * aside[lane]
         sine[lane] += turn_rate[lane] * along[lane]
+    for lane in range(turn_rate.shape[0] if largest * dt > SMALL_TURN else 0):
+        turn = turn_rate[lane] * dt
+        if abs(turn) > SMALL_TURN:
+            before = pose[2, lane]
+            cosine[lane] = math.cos(before + turn)
+            sine[lane] = math.sin(before + turn)
+            along[lane] = (sine[lane] - math.sin(before)) / turn_rate[lane]
+            aside[lane] = (math.cos(before) - cosine[lane]) / turn_rate[lane]
 
 
 @kernel
@@ -444,17 +512,47 @@ def _twist(state: Array, bicycle: BicycleGeometry) -> tuple[float, float, float]
 
 
 @kernel
+def _keep_lags(share: float, dt: float, lag: Array) -> tuple[float, float, float]:
+    """Returns the shares of their distances from the targets that actuators keep in a step."""
+    span = share * dt
+    return (
+        1.0 / (1.0 + span / lag[0]),
+        1.0 / (1.0 + span / lag[1]),
+        1.0 / (1.0 + span / lag[2]),
+    )
+
+
+@kernel
 def _advance_actuator(
-    state: Array, target: Array, place: float, span: float, lag: Array, limit: Array
+    state: Array,
+    target: Array,
+    place: float,
+    kept: tuple[float, float, float],
+    lag: Array,
+    limit: Array,
 ) -> None:
-    """Moves an actuator (3,) for a time towards its target (G, 3) at a place between rows."""
+    """Moves an actuator (3,) towards its target (G, 3) at a place between rows."""
     held = min(max(place, 0.0), len(target) - 2.0)
     k = int(held)
     for i in range(3):
         aim = target[k, i] + (held - k) * (target[k + 1, i] - target[k, i])
         if i == 0:
             aim = _limited(state[0], aim, lag[0], limit)
-        state[i] = aim + (state[i] - aim) / (1.0 + span / lag[i])
+        state[i] = aim + (state[i] - aim) * kept[i]
+
+
+@kernel
+def _rotate_half(half: float) -> tuple[float, float]:
+    """Returns cosine and sine of half the turn of a step."""
+    if abs(half) > SMALL_TURN:
+        return math.cos(half), math.sin(half)
+    square = half * half
+    cosine = 1.0 - square / 30.0 * (1.0 - square / 56.0)
+    sine = 1.0 - square / 42.0 * (1.0 - square / 72.0)
+    return (
+        1.0 - square / 2.0 * (1.0 - square / 12.0 * cosine),
+        half * (1.0 - square / 6.0 * (1.0 - square / 20.0 * sine)),
+    )
 
 
 @kernel
@@ -475,23 +573,27 @@ def roll_windows(
     angle of a steered robot; `target` (G, 3) their targets on a grid, `begin` (W,) indices in it;
     `lag` (3,) [s]; `limit` (2,) of the speed's acceleration and deceleration [m/s^2].
     """
+    kept_by_step = _keep_lags(1.0, dt, lag)
     for w in range(len(begin)):
         x = 0.0
         y = 0.0
         heading = 0.0
+        c = 1.0
+        s = 0.0
         done = 0.0
         for h in range(stops.shape[1]):
             while done < stops[w, h] - 1e-9:
                 share = min(1.0, stops[w, h] - done)
-                span = share * dt
+                kept = kept_by_step if share == 1.0 else _keep_lags(share, dt, lag)
                 place = begin[w] + done
-                _advance_actuator(actuator[w], target, place, span, lag, limit)
+                _advance_actuator(actuator[w], target, place, kept, lag, limit)
                 vx, vy, turn_rate = _twist(actuator[w], bicycle)
-                middle = heading + 0.5 * turn_rate * span
-                c = math.cos(middle)
-                s = math.sin(middle)
+                span = share * dt
+                cosine, sine = _rotate_half(0.5 * turn_rate * span)
+                c, s = c * cosine - s * sine, s * cosine + c * sine  # half-way
                 x += span * (c * vx - s * vy)
                 y += span * (s * vx + c * vy)
+                c, s = c * cosine - s * sine, s * cosine + c * sine
                 heading += turn_rate * span
                 done += share
             ends[w, h, 0] = x

@@ -119,8 +119,10 @@ def _predict_errors(
     )
     if len(chosen.start_t) < MIN_WINDOWS:
         return None
-    # along a measured state, so that its drift is not counted twice
-    ends = open_loop.predict(model, calibration, drive, chosen, along_states=True)
+    if drive.recording.state is None:
+        ends = open_loop.predict(model, calibration, drive, chosen)
+    else:  # restart from the measured state, so that its drift is not counted twice
+        ends = open_loop.predict_along_states(model, calibration, drive, chosen)
     return chosen, geometry.between(ends, chosen.end)
 
 

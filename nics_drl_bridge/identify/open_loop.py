@@ -102,22 +102,22 @@ def _select_apart(t: Array, least: float) -> list[int]:
 
 
 def predict(
-    model: TaylorModel,
-    calibration: Calibration,
-    drive: Drive,
-    chosen: Windows,
-    along_states: bool = False,
+    model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> Array:
-    """Predicts poses (W, 3) at windows' ends from commands and measured or inferred states.
-
-    A measured state is that at the start of a window, or `along_states` that all the way.
-    """
+    """Predicts poses (W, 3) at windows' ends from commands and measured or inferred states."""
     if drive.recording.state is None:
         relative = _by_one_rollout(model, calibration, drive, chosen)
     else:
-        relative = _by_windows(model, calibration, drive, chosen, along_states)
-    base = geometry.compose(calibration.to_base(chosen.start), relative)
-    return calibration.to_tracked(base)
+        relative = _by_windows(model, calibration, drive, chosen)
+    return convert_to_tracked(chosen, calibration, relative)
+
+
+def predict_along_states(
+    model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
+) -> Array:
+    """Predicts poses (W, 3) at windows' ends from the states that were measured on the way."""
+    relative = _by_windows(model, calibration, drive, chosen, states_known=True)
+    return convert_to_tracked(chosen, calibration, relative)
 
 
 def _by_windows(
@@ -125,9 +125,12 @@ def _by_windows(
     calibration: Calibration,
     drive: Drive,
     chosen: Windows,
-    along_states: bool,
+    states_known: bool = False,
 ) -> Array:
-    """Returns relative poses (W, 3) from rollouts, each from the state measured at its start."""
+    """Returns relative poses (W, 3) from rollouts, each from the state measured at its start.
+
+    With `states_known`, the states are those measured all along a window.
+    """
     begin = chosen.start_t + calibration.clock_offset_s
     length = (chosen.end_t - chosen.start_t) / model.dt
     count = int(np.ceil(float(length.max()) - 1e-6)) + 1
@@ -136,7 +139,7 @@ def _by_windows(
     command = average_effect(
         drive.recording.command, drive.spec, model.inputs, sent_t, sent_t + model.dt
     )
-    if along_states:
+    if states_known:
         states = resample_states(drive, calibration, t)
         rates = model.rates(np.concatenate([states, command], axis=2))
         poses = _integrate_twists(rates[..., :3], model.dt)
@@ -159,6 +162,15 @@ def _integrate_twists(twist: Array, dt: float) -> Array:
     poses[:, 1:, :2] = np.cumsum(moved, axis=1)
     poses[:, 1:, 2] = heading
     return poses
+
+
+def convert_to_tracked(
+    chosen: Windows, calibration: Calibration, relative: Array
+) -> Array:
+    """Returns poses (W, 3) of the tracked body after `base_link` moved by relative poses."""
+    return calibration.to_tracked(
+        geometry.compose(calibration.to_base(chosen.start), relative)
+    )
 
 
 def _by_one_rollout(

@@ -12,7 +12,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.effects import list_driving_commands
+from nics_drl_bridge.identify.forms import list_driving_commands
 from nics_drl_bridge.identify.signals import (
     average_between_stamps,
     average_held,
@@ -51,6 +51,7 @@ STATE_SHARE = 0.2  # and this fraction of the usual range, for a state
 # A localiser jumps permanently where a step differs from the surrounding motion by more than
 # this many times the distance at the speed (turn rate) that 95 % of the drive stays below
 FARTHER = 3.0
+SPEED_OVER_S = 0.5  # over this time
 UNUSUAL = 12.0  # this many usual differences (`USUAL`)
 # and this fraction of the robot's radius, or this angle [rad]
 JUMP_SHARE = 0.5
@@ -246,7 +247,7 @@ def _join_at_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
     if len(t) < 2 * AROUND + 2:
         return recording
     expected, apart = _compare_steps(t, pose)
-    jump = (apart > _limit_steps(drive, expected, apart)).any(axis=0)
+    jump = (apart > _limit_steps(drive, apart)).any(axis=0)
     if not jump.any() or jump.mean() > MOST_JUMPS:
         return recording
     joined = pose.copy()
@@ -286,18 +287,24 @@ def _compare_steps(t: Array, pose: Array) -> tuple[Array, Array]:
     return expected, np.stack([np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2])])
 
 
-def _limit_steps(drive: Drive, expected: Array, apart: Array) -> Array:
-    """Returns the allowed difference of steps (2, T), in m and rad, from the usual ones (T, 3)."""
-    span = np.diff(drive.sample_t)
-    usual = np.stack([np.hypot(expected[:, 0], expected[:, 1]), np.abs(expected[:, 2])])
-    fastest = np.percentile(usual / np.maximum(span, 1e-9), 95.0, axis=1)
+def _limit_steps(drive: Drive, apart: Array) -> Array:
+    """Returns the allowed difference of steps (2, T), in m and rad, from those around them."""
+    t = drive.sample_t
+    pose = unwrap_headings(drive.recording.pose.values)
+    every = np.unique(np.searchsorted(t, np.arange(t[0], t[-1], SPEED_OVER_S)))
+    took = np.maximum(np.diff(t[every]), 1e-9)
+    gone = np.abs(np.diff(pose[every], axis=0))
+    rates = np.stack([np.hypot(*gone[:, :2].T), gone[:, 2]]) / took
     speeds = [
         max(abs(c.min), abs(c.max)) for c in drive.spec.command if c.unit == "m/s"
     ]
+    fastest = np.percentile(rates, 95.0, axis=1) if len(took) else np.zeros(2)
     fastest[0] = max(fastest[0], REACH / FARTHER * max(speeds, default=0.0))
     floor = np.array([JUMP_SHARE * drive.spec.footprint_radius, JUMP_TURN])
     floor = np.maximum(floor, UNUSUAL * np.percentile(apart, USUAL, axis=1))
-    return np.asarray(np.maximum(floor[:, None], FARTHER * np.outer(fastest, span)))
+    return np.asarray(
+        np.maximum(floor[:, None], FARTHER * fastest[:, None] * np.diff(t))
+    )
 
 
 def _select_outliers(

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.identify.fit import Alpha, describe_narrow_commands
+from nics_drl_bridge.identify.hypotheses import PRUNING, list_candidates
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.judgement import (
     Verdict,
@@ -17,7 +18,6 @@ from nics_drl_bridge.identify.judgement import (
     select_usual_horizon,
 )
 from nics_drl_bridge.identify.repair import describe_reference
-from nics_drl_bridge.identify.selection import PRUNING, list_candidates
 from nics_drl_bridge.identify.signals import select_moved_commands
 from nics_drl_bridge.identify.statistics import Curve
 from nics_drl_bridge.identify.verdict import (
@@ -166,39 +166,58 @@ def list_motor_effects(identified: Identified) -> Iterator[str]:
     """
     sigma = identified.calibration.uncertainty
     units = list_units(identified.drive.spec)
-    for name, words, value, unit in _list_effects(identified.model, units):
-        without_effect = 1.0 if name.endswith(".back") else 0.0
-        if value == without_effect or not isfinite(value):
+    effects = (
+        *_list_curve_effects(identified.model, units),
+        *_list_state_effects(identified.model),
+    )
+    for name, parameter, words, value, unit, usual in effects:
+        if value == usual:
             continue
-        error = sigma.get(name)
+        error = sigma.get(f"{name}.{parameter}")
         spread = "" if error is None else f" +- {error:.2g}"
-        owner = name.partition(".")[0]
-        yield f"{owner:<24} {words}: {value:.4g}{spread} {unit}".rstrip()
+        yield f"{name:<24} {words}: {value:.4g}{spread} {unit}".rstrip()
 
 
-def _list_effects(
-    model: TaylorModel, units: Mapping[str, str]
-) -> Iterator[tuple[str, str, float, str]]:
-    """Yields name, description, value and unit of each parameter of curves and states."""
+# name, parameter, description, value, unit, and the value that means "no effect"
+Effect = tuple[str, str, str, float, str, float]
+
+
+def _list_curve_effects(model: TaylorModel, units: Mapping[str, str]) -> list[Effect]:
+    """Lists the parameters of the input curves."""
+    effects: list[Effect] = []
+    back = "reverse gain, relative to forward"
     for curve in model.inputs:
         name = curve.command
+        unit = units[name]
         dead = DEAD_ZONE if curve.dead > 0.0 else EAGER
-        yield f"{name}.dead", dead, curve.dead, units[name]
-        yield f"{name}.least", "saturates below", curve.least, units[name]
-        yield f"{name}.most", "saturates above", curve.most, units[name]
-        yield f"{name}.back", "reverse gain, relative to forward", curve.back, ""
-        yield f"{name}.delay", "delay after the common latency", curve.delay, "s"
+        effects += [
+            (name, "dead", dead, curve.dead, unit, 0.0),
+            (name, "least", "saturates below", curve.least, unit, -np.inf),
+            (name, "most", "saturates above", curve.most, unit, np.inf),
+            (name, "back", back, curve.back, "", 1.0),
+            (name, "delay", "delay after the common latency", curve.delay, "s", 0.0),
+        ]
+    return effects
+
+
+def _list_state_effects(model: TaylorModel) -> list[Effect]:
+    """Lists the limits, friction, drag and back-EMF of the states."""
+    effects: list[Effect] = []
     commands = model.variables[model.state_size :]
     for i, state in enumerate(model.variables[: model.state_size]):
         unit = model.dof_units[3 + i]
         fall, rise = model.limits[i].tolist()
-        yield f"{state}.fall", "maximum fall", fall, unit
-        yield f"{state}.rise", "maximum rise", rise, unit
-        yield f"{state}.friction", "dry friction", float(model.friction[i]), unit
-        yield f"{state}.drag", "drag, times its square", float(model.drag[i]), ""
+        friction = float(model.friction[i])
+        effects += [
+            (state, "fall", "maximum fall", fall, unit, -np.inf),
+            (state, "rise", "maximum rise", rise, unit, np.inf),
+            (state, "friction", "dry friction", friction, unit, 0.0),
+            (state, "drag", "drag, times its square", float(model.drag[i]), "", 0.0),
+        ]
         for command, value in zip(commands, model.back_emf[i].tolist(), strict=True):
             words = f"back-EMF, times {state} and |{command}|"
-            yield f"{state}.back_emf.{command}", words, value, ""
+            effects.append((state, f"back_emf.{command}", words, value, "", 0.0))
+    return effects
 
 
 def format_with_error(value: float, error: float | None) -> str:

@@ -16,6 +16,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.kernels import (
     Shot,
     allocate_tangent,
+    make_used_terms,
     shoot,
 )
 from nics_drl_bridge.identify.open_loop import put_states
@@ -26,7 +27,6 @@ from nics_drl_bridge.identify.statistics import (
 )
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
-from nics_drl_bridge.robot.kernels import make_terms
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 Mask = NDArray[np.bool_]
@@ -56,6 +56,7 @@ EVALUATIONS = 60
 # minimum distance of a start value from its bounds, as a fraction of its range
 INSIDE = 0.05
 LEAST_SCALE = 0.02  # scale of the loss, below which errors count by their squares [m/s]
+NO_ERROR = 1e-9
 STEEPEST = 1e6  # derivatives of a diverging model are clipped
 SAME_STEP = 0.01  # fraction of a step by which two steps may differ
 
@@ -66,7 +67,7 @@ class Parameters:
 
     A name is `latency`, a part of the mounting (`x`, `y` and `heading`), or a command or state with
     one of its parameters, such as `throttle.delay` [s], `throttle.dead`, `vx.lag` [s], `vx.gain`,
-    or `vx.rise` and `vx.fall` (limits). `effects.list_plain_rows` and others list them.
+    or `vx.rise` and `vx.fall` (limits). `forms.list_parameters` lists them.
     """
 
     names: tuple[str, ...]
@@ -83,12 +84,6 @@ class Parameters:
     def name(self, values: Array) -> Values:
         """Returns values (I,) by name."""
         return dict(zip(self.names, values.tolist(), strict=True))
-
-    @property
-    def rows(self) -> dict[str, tuple[float, float, float, float]]:
-        """Start, scale and bounds by name."""
-        columns = np.stack([self.start, self.scale, self.low, self.high], axis=1)
-        return dict(zip(self.names, map(tuple, columns.tolist()), strict=True))
 
     def freeze(self) -> "Parameters":
         """Returns the same parameters, known to have their start values."""
@@ -185,18 +180,16 @@ class Shooting:
     ) -> tuple[Array, Array]:
         """Returns poses (W, H, 3), derivatives (W, H, 3, P) by the `free` (D, K) coefficients."""
         at = self.parameters.name(values)
+        state = self.samples.q[:, 3:] if self.inferred is None else self.inferred(at)
         command = self.commands(at)
         if free is None:
             free = np.zeros(model.coefficients.shape, dtype=np.bool_)
-        if self.inferred is None:
-            state = self.samples.q[:, 3:]
+        if self.inferred is None and state.shape[1]:
             model = self.shape(model, at)
-        else:  # no state depends on where a window starts
-            command = np.concatenate([self.inferred(at), command], axis=1)
-            state = command[:, :0]
-            model = _take_twist(model)
-            free = free[:3]
-        end, slope = _predict_windows(model, state, command, first, steps, free)
+            end, slope = _predict_windows(model, state, command, first, steps, free)
+        else:  # no state depends on where a window starts, nor does a shape affect the twist
+            x = np.concatenate([state, command], axis=1)
+            end, slope = predict_along_path(model, x, first, steps, free)
         if self.is_mounted:
             mounting = np.array([at["x"], at["y"], at["heading"]])
             return _mount_poses(mounting, end, slope)
@@ -243,10 +236,7 @@ def _predict_windows(
 ) -> tuple[Array, Array]:
     """Rolls a model out from the first state of each window; see `Shooting.predict`."""
     used = (model.coefficients != 0.0) | free
-    # A free term is used though its coefficient may be 0; commands are those in effect.
-    terms = make_terms(replace(model, coefficients=used * 1.0, inputs=()))
-    terms = terms._replace(coefficient=model.coefficients[used])
-    moving = np.flatnonzero(free[used])
+    terms, moving = make_used_terms(model, used, free)
     shot = Shot(
         np.ascontiguousarray(state[first]),
         first,
@@ -260,20 +250,91 @@ def _predict_windows(
     return shot.end, shot.slope
 
 
-def _take_twist(model: TaylorModel) -> TaylorModel:
-    """Returns the twist of a model as that of a robot without a state, all of whose X are given."""
-    return replace(
-        model,
-        dofs=model.dofs[:3],
-        dof_units=model.dof_units[:3],
-        coefficients=model.coefficients[:3],
-        std_errors=np.zeros((0, 0)),
-        bounded=False,
-        friction=np.zeros(0),
-        drag=np.zeros(0),
-        back_emf=np.zeros((0, 0)),
-        limits=np.zeros((0, 2)),
-    )
+def predict_along_path(
+    model: TaylorModel, x: Array, first: Rows, steps: Rows, free: Mask
+) -> tuple[Array, Array]:
+    """Predicts windows from one path through all X (T, V), if only the twist has free terms.
+
+    Returns the same as `Shooting.predict`.
+    """
+    chi = _evaluate_terms(x, model.powers)
+    path = _Path.along(model.coefficients[:3] @ chi, model.dt)
+    last = first[:, None] + steps
+    moved = path.pose[:, last] - path.pose[:, first][..., None]
+    slopes = []
+    for dof in range(3):
+        slope = path.differentiate(chi[free[dof]], dof)
+        # How the heading changes before a window does not count in it.
+        turned = slope[:, 2, first][..., None]
+        slope = slope[..., last] - slope[..., first][..., None]
+        slope[:, 0] += turned * moved[1]
+        slope[:, 1] -= turned * moved[0]
+        slopes.append(slope)
+    heading = path.pose[2, first][:, None]
+    end = _turn_back(moved[None], heading)[0]
+    slope = _turn_back(np.concatenate(slopes), heading)
+    return np.moveaxis(end, 0, -1), np.moveaxis(slope, (0, 1), (-1, -2))
+
+
+def _evaluate_terms(x: Array, powers: NDArray[np.int64]) -> Array:
+    """Returns the terms (K, T) of X (T, V)."""
+    columns = np.ascontiguousarray(x.T)
+    chi = np.ones((len(powers), len(x)))
+    for term, row in zip(chi, powers, strict=True):
+        for variable in np.repeat(np.arange(len(row)), row):
+            term *= columns[variable]
+    return chi
+
+
+def _turn_back(moved: Array, heading: Array) -> Array:
+    """Returns motions (n, 3, W, H) as seen from headings (W, 1)."""
+    c = np.cos(heading)
+    s = np.sin(heading)
+    x = c * moved[:, 0] + s * moved[:, 1]
+    y = c * moved[:, 1] - s * moved[:, 0]
+    return np.stack([x, y, moved[:, 2]], axis=1)
+
+
+@dataclass(frozen=True)
+class _Path:
+    """A path by known twists."""
+
+    pose: Array  # (3, T + 1) from the origin; the heading is unwrapped
+    turn: Array  # (T,) by each step [rad]
+    ahead: Array  # (2, T) way of a step per unit of vx [s]
+    dt: float
+
+    @classmethod
+    def along(cls, twist: Array, dt: float) -> "_Path":
+        """Integrates twists (3, T) along arcs over steps of dt [s]."""
+        turn = dt * twist[2]
+        heading = np.append(0.0, np.cumsum(turn))
+        middle = heading[:-1] + turn / 2.0
+        chord = dt * np.sinc(turn / (2.0 * np.pi))
+        ahead = chord * np.stack([np.cos(middle), np.sin(middle)])
+        aside = np.stack([-ahead[1], ahead[0]])
+        place = np.cumsum(twist[0] * ahead + twist[1] * aside, axis=1)
+        pose = np.concatenate([np.zeros((2, 1)), place], axis=1)
+        return cls(np.concatenate([pose, heading[None]]), turn, ahead, dt)
+
+    def differentiate(self, chi: Array, dof: int) -> Array:
+        """Returns derivatives (P, 3, T + 1) by the coefficients of terms (P, T) of a dof."""
+        slope = np.zeros((len(chi), 3, self.pose.shape[1]))
+        x, y, heading = np.swapaxes(slope[..., 1:], 0, 1)
+        if dof == 0:
+            x[:] = self.ahead[0] * chi
+            y[:] = self.ahead[1] * chi
+        elif dof == 1:
+            x[:] = -self.ahead[1] * chi
+            y[:] = self.ahead[0] * chi
+        else:
+            dx, dy = np.diff(self.pose[:2])
+            heading[:] = self.dt * chi
+            lean = np.cumsum(heading, axis=1) - heading / 2.0
+            shorter = -self.turn / 12.0 * heading
+            x[:] = shorter * dx - lean * dy
+            y[:] = shorter * dy + lean * dx
+        return np.cumsum(slope, axis=2, out=slope)
 
 
 def _mount_poses(mounting: Array, base: Array, slope: Array) -> tuple[Array, Array]:
@@ -297,13 +358,19 @@ class Predictive:
     """A model fitted to predictions; its uncertainty is computed when it is asked for."""
 
     model: TaylorModel
-    parameters: Parameters  # they start from the values found
+    names: tuple[str, ...]  # of the parameters
+    values: Array  # (I,) of the parameters
     search: "_Search"
     theta: Array  # the minimum, as the search scales it
 
     @cached_property
     def _uncertainty(self) -> tuple[Array, Array]:
         return self.search.estimate_uncertainty(self.theta)
+
+    @property
+    def residual(self) -> Array:
+        """The scaled errors (n,) of the predictions [m/s]."""
+        return self.search.measure_errors(self.theta)
 
     @property
     def value_covariance(self) -> Array:
@@ -318,13 +385,22 @@ class Predictive:
     @property
     def named(self) -> Values:
         """Values of the parameters, by name."""
-        return self.parameters.name(self.parameters.start)
+        return dict(zip(self.names, self.values.tolist(), strict=True))
 
     @property
     def errors(self) -> Values:
         """Standard errors of the parameters, by name; NaN for known ones."""
-        variances = np.maximum(np.diag(self.value_covariance), 0.0)
-        return self.parameters.name(np.sqrt(variances))
+        errors = np.sqrt(np.maximum(np.diag(self.value_covariance), 0.0))
+        return dict(zip(self.names, errors.tolist(), strict=True))
+
+    @property
+    def shown_errors(self) -> Values:
+        """Errors of the parameters of commands and states, such as `throttle.dead`.
+
+        Parameters that do not affect the predictions are left out.
+        """
+        errors = self.errors.items()
+        return {name: e for name, e in errors if "." in name and e > NO_ERROR}
 
 
 def fit_to_predictions(
@@ -466,7 +542,7 @@ class _Search:
         )
         model, values = self.at(best)
         model = self.problem.shape(model, self.parameters.name(values))
-        return Predictive(model, replace(self.parameters, start=values), self, best)
+        return Predictive(model, self.parameters.names, values, self, best)
 
     def _list_bounds(self) -> tuple[Array, Array]:
         """Returns the bounds (I + P,) of the scaled values; coefficients have none."""

@@ -11,10 +11,15 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-WEAK = 1e4  # condition number of instruments x features above which instruments are too weak
-CLUSTERS = 60  # stretches of rows whose errors are taken to be independent
+UNLIKE = 0.05  # correlation below which residuals are assumed to be independent
+LONGEST = 0.1  # longest correlation of residuals, as a fraction of the rows
 # minimum ratio of a term of a noisy fit, or of a correction, to its standard error
 CERTAIN = 3.0
+WEAK = 1e4  # condition number of instruments x features above which instruments are too weak
+# relative step and termination of `minimise`
+DIFFERENCE = 1e-4
+TOLERANCE = 1e-7
+MAX_STEPS = 40
 # relative improvement of the loss below which `minimise_robustly` ends: hundreds of searches rank
 # models whose errors differ by per cent
 ROBUST_TOLERANCE = 1e-4
@@ -39,6 +44,30 @@ def compute_unexplained(chi: Array, signal: Array) -> Array:
         np.concatenate([np.ones((len(chi), 1)), chi], axis=1), scaled, 1e-10
     )[0]
     return np.asarray(scaled - beta[0] - chi @ beta[1:]).ravel()
+
+
+def minimise(
+    residual: Callable[[Array], Array],
+    start: Array,
+    scale: Array,
+    bounds: tuple[Array, Array],
+) -> tuple[Array, Array, Array]:
+    """Minimises a residual (n,) within bounds (P,); returns minimum, Jacobian (n, P), residual."""
+    low, high = ((bound - start) / scale + 1.0 for bound in bounds)
+    solution = scipy.optimize.least_squares(
+        lambda z: residual(start + (z - 1.0) * scale),
+        np.ones(len(start)),
+        bounds=(low, high),
+        diff_step=DIFFERENCE,
+        xtol=TOLERANCE,
+        ftol=TOLERANCE,
+        max_nfev=MAX_STEPS,
+    )
+    return (
+        start + (solution.x - 1.0) * scale,
+        solution.jac / scale,
+        np.asarray(solution.fun),
+    )
 
 
 def minimise_robustly(
@@ -141,18 +170,45 @@ def _sum_softly(residual: Array, size: float) -> float:
     return float(size**2 * (np.hypot(1.0, residual / size) - 1.0).sum())
 
 
+def estimate_uncertainty(jacobian: Array, residual: Array) -> Array:
+    """Returns standard uncertainties (P,) of least squares, widened for correlated residuals."""
+    rest = residual - residual.mean()
+    power = float((rest**2).sum())
+    rho = float((rest[1:] * rest[:-1]).sum()) / power if power > 0.0 else 0.0
+    rho = float(np.clip(rho, 0.0, 0.95))
+    variance = (
+        power / max(1, len(residual) - jacobian.shape[1]) * (1.0 + rho) / (1.0 - rho)
+    )
+    return _deviations(np.linalg.pinv(jacobian.T @ jacobian) * variance)
+
+
 def _deviations(covariance: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 
 
 def estimate_standard_errors(chi: Array, residual: Array) -> Array:
-    """Returns standard errors (K,) for residuals (T,) that resemble their neighbours in time.
-
-    Each of `CLUSTERS` stretches of rows counts as one observation.
-    """
+    """Returns standard errors (K,) for correlated residuals (T,) by time (Newey, West 1987)."""
+    count, terms = chi.shape
+    if terms == 0 or count <= terms:
+        return np.full(terms, np.nan)
     scale = np.maximum(np.linalg.norm(chi, axis=0), np.finfo(np.float64).tiny)
-    cluster = np.arange(len(chi)) * CLUSTERS // max(len(chi), 1)
-    return np.asarray(estimate_clustered_errors(chi / scale, residual, cluster) / scale)
+    unit = chi / scale
+    middle = estimate_long_run_covariance(unit, residual)
+    inverse = np.linalg.pinv(unit.T @ unit, hermitian=True)
+    return np.asarray(
+        _deviations(inverse @ middle @ inverse * count / (count - terms)) / scale
+    )
+
+
+def estimate_long_run_covariance(chi: Array, residual: Array) -> Array:
+    """Returns the covariance (K, K) of summed features (T, K) x autocorrelated residuals (T,)."""
+    scores = chi * residual[:, None]
+    middle = scores.T @ scores
+    reach = find_correlation_reach(residual)
+    for lag in range(1, reach + 1):
+        cross = scores[lag:].T @ scores[:-lag]
+        middle += (1.0 - lag / (reach + 1.0)) * (cross + cross.T)
+    return np.asarray(middle)
 
 
 def estimate_clustered_errors(
@@ -186,6 +242,25 @@ def estimate_clustered_covariance(
     if len(groups) > 3:  # variance of Student's t
         few *= (len(groups) - 1.0) / (len(groups) - 3.0)
     return np.asarray(inverse @ (sums.T @ sums) @ inverse * few)
+
+
+def find_correlation_reach(residual: Array) -> int:
+    """Returns the largest lag [rows] at which residuals (T,) are treated as correlated."""
+    count = len(residual)
+    usual = int(4.0 * (count / 100.0) ** (2.0 / 9.0))
+    rest = residual - residual.mean()
+    power = float(rest @ rest)
+    if power <= 0.0:
+        return usual
+    longest = max(usual, int(LONGEST * count))
+    size = 1 << (2 * count - 1).bit_length()
+    alike = (
+        np.fft.irfft(np.abs(np.fft.rfft(rest, size)) ** 2, size)[1 : longest + 1]
+        / power
+    )
+    unlike = np.flatnonzero(alike < UNLIKE)
+    apart = int(unlike[0]) + 1 if len(unlike) else longest
+    return min(max(usual, 2 * apart), longest, count - 1)
 
 
 def compute_condition(chi: Array) -> float:
@@ -234,16 +309,16 @@ def fit_by_instruments(
     """Returns coefficients (K,) and errors by instruments (T, K); None if these are too weak."""
     # Two-stage least squares (Soederstroem, Stoica 1983).
     scale = np.linalg.norm(chi, axis=0)
-    instruments = instruments / np.linalg.norm(instruments, axis=0)
-    bread = instruments.T @ chi / scale
+    size = np.linalg.norm(instruments, axis=0)
+    chi = chi / scale
+    instruments = instruments / size
+    bread = instruments.T @ chi
     if not np.linalg.cond(bread) < WEAK:
         return None
     inverse = np.linalg.inv(bread)
-    beta = inverse @ (instruments.T @ target) / scale
-    scores = instruments * (target - chi @ beta)[:, None]
-    sums = [part.sum(axis=0) for part in np.array_split(scores, CLUSTERS)]
-    errors = np.linalg.norm(np.array(sums) @ inverse.T, axis=0)
-    return beta, errors / scale
+    beta = inverse @ (instruments.T @ target)
+    middle = estimate_long_run_covariance(instruments, target - chi @ beta)
+    return beta / scale, np.sqrt(np.diag(inverse @ middle @ inverse.T)) / scale
 
 
 @dataclass(frozen=True)
@@ -283,21 +358,32 @@ def find_knee(error: Array, sigma: Array) -> int:
 
 def cross_validated(chi: Array, target: Array) -> Array:
     """Returns mean squared errors (B, n + 1) of 0..n features on B blocks, fitted to the others."""
+    rows = np.array_split(np.arange(len(target)), BLOCKS)
+    both = np.concatenate([chi, target[:, None]], axis=1)
+    triangles = [
+        np.atleast_2d(scipy.linalg.qr(both[r], mode="r", check_finite=False)[0])
+        for r in rows
+    ]
+    triangles = [t[: both.shape[1]] for t in triangles]
     result = np.empty((BLOCKS, chi.shape[1] + 1))
-    for block, unseen in enumerate(np.array_split(np.arange(len(target)), BLOCKS)):
-        others = np.delete(np.column_stack([chi, target]), unseen, axis=0)
-        r = np.asarray(np.linalg.qr(others, mode="r"))
+    for block, unseen in enumerate(triangles):
+        others = np.concatenate([t for b, t in enumerate(triangles) if b != block])
+        r = scipy.linalg.qr(others, mode="economic", check_finite=False)[1]
         for n in range(chi.shape[1] + 1):
-            beta = scipy.linalg.solve_triangular(_make_solvable(r[:n, :n]), r[:n, -1])
-            rest = target[unseen] - chi[unseen, :n] @ beta
-            result[block, n] = float((rest**2).mean())
+            beta = (
+                scipy.linalg.solve_triangular(_make_solvable(r[:n, :n]), r[:n, -1])
+                if n
+                else np.zeros(0)
+            )
+            rest = unseen[:, -1] - unseen[:, :n] @ beta
+            result[block, n] = float(rest @ rest) / len(rows[block])
     return result
 
 
 def _make_solvable(r: Array) -> Array:
     """Makes a triangle solvable by dropping features that the other blocks did not excite."""
     diagonal = np.abs(np.diag(r))
-    singular = diagonal <= 1e-10 * max(float(diagonal.max(initial=0.0)), 1e-300)
+    singular = diagonal <= 1e-10 * max(float(diagonal.max()), 1e-300)
     if not singular.any():
         return r
     r = r.copy()

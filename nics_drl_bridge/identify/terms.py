@@ -14,7 +14,7 @@ that cause them, such as a steering angle. The motion of the image is the image 
 that vx is even in these variables, and vy and wz are odd.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 from functools import partial
@@ -32,7 +32,9 @@ from nics_drl_bridge.identify.fit import (
     TOGETHER,
     Alpha,
     Fit,
+    Regression,
     find_constant_combinations,
+    fit_kept_terms,
     list_unmoved_variables,
     prune_and_refit,
     regress,
@@ -88,16 +90,26 @@ class Library:
     alpha: Alpha
     order: int
 
-    def fit(self, samples: Samples, order: int, with_errors: bool = False) -> Fit:
-        """Fits the terms up to an order; those of a motion have no errors."""
+    def fit(self, samples: Samples, order: int) -> Fit:
+        """Fits the terms up to an order."""
         if self.kind is Kind.MOTION:
-            return fit_motion_terms(samples, self.spec, order, select_motion_terms)
-        through = None
-        if self.kind is Kind.FOLLOWER:
-            through = partial(select_terms_through_state, centred=self.centred)
-        regression = regress(samples, self.spec, order, True, through)
-        fit = prune_and_refit(regression, self.spec, self.alpha, with_errors)
+            return fit_motion_terms(samples, self.spec, order)
+        fit = prune_and_refit(self._regress(samples, order), self.spec, self.alpha)
         return replace(fit, model=self._define(fit.model))
+
+    def fit_model(self, samples: Samples, order: int) -> TaylorModel:
+        """Fits the terms up to an order, without errors, which take most of the time."""
+        if self.kind is Kind.MOTION:
+            return fit_motion_model(samples, self.spec, order, select_motion_terms)
+        regression = self._regress(samples, order)
+        return self._define(fit_kept_terms(regression, self.spec, self.alpha))
+
+    def _regress(self, samples: Samples, order: int) -> Regression:
+        """Fits all terms up to an order that a state which is no motion may have."""
+        allowed = None
+        if self.kind is Kind.FOLLOWER:
+            allowed = partial(select_terms_through_state, centred=self.centred)
+        return regress(samples, self.spec, order, True, allowed)
 
     def _define(self, model: TaylorModel) -> TaylorModel:
         """Drops lateral motion that is noise; an inferred speed is that along x."""
@@ -123,16 +135,15 @@ class Library:
     def fit_base(self, samples: Samples, tyres: bool) -> TaylorModel:
         """Fits the base: the textbook's terms of a motion, else those up to its order."""
         if self.kind is Kind.MEASURED:
-            return self.fit(samples, self.order).model
+            return self.fit_model(samples, self.order)
         if self.kind is Kind.FOLLOWER:
             through = partial(
                 select_terms_through_state, centred=self.centred, by_book=True
             )
             regression = regress(samples, self.spec, self.order, False, through)
-            fit = prune_and_refit(regression, self.spec, 1.0, with_errors=False)
-            return self._define(fit.model)
+            return self._define(fit_kept_terms(regression, self.spec, 1.0))
         allowed = partial(select_textbook_terms, tyres=tyres)
-        return fit_motion_terms(samples, self.spec, self.order, allowed).model
+        return fit_motion_model(samples, self.spec, self.order, allowed)
 
     def select_free(self, model: TaylorModel) -> Mask:
         """Selects the coefficients (D, K) that no definition and no measurement fixes."""
@@ -146,21 +157,46 @@ class Library:
 
 
 def fit_motion_terms(
-    samples: Samples, spec: RobotSpec, order: int, allowed: Callable[..., Mask]
+    samples: Samples,
+    spec: RobotSpec,
+    order: int,
+    allowed: Callable[..., Mask] | None = None,
 ) -> Fit:
-    """Fits the terms of a motion up to an order to its rates (Eq. 1), without pruning or errors.
+    """Fits the terms of a motion up to an order to its rates (Eq. 1), without pruning.
 
     Args:
         samples: rows of a drive whose state is the motion.
         spec: the robot.
         order: of the terms.
-        allowed: a term filter.
+        allowed: a term filter; by default `select_motion_terms`.
     """
     constants = _find_constant_variables(samples, spec)
-    held = tuple(c.name for c in spec.command if constants.get(c.name))
-    regression = regress(samples, spec, order, term_filter=partial(allowed, held=held))
-    fit = prune_and_refit(regression, spec, 1.0, with_errors=False)
+    regression = _regress_motion(
+        samples, spec, order, allowed or select_motion_terms, constants
+    )
+    fit = prune_and_refit(regression, spec, 1.0)
     return replace(fit, model=_define_motion(fit.model, samples, spec, constants))
+
+
+def fit_motion_model(
+    samples: Samples, spec: RobotSpec, order: int, allowed: Callable[..., Mask]
+) -> TaylorModel:
+    """Does the same as `fit_motion_terms`, without errors, which take most of the time."""
+    constants = _find_constant_variables(samples, spec)
+    regression = _regress_motion(samples, spec, order, allowed, constants)
+    model = fit_kept_terms(regression, spec, 1.0)
+    return _define_motion(model, samples, spec, constants)
+
+
+def _regress_motion(
+    samples: Samples,
+    spec: RobotSpec,
+    order: int,
+    allowed: Callable[..., Mask],
+    constants: dict[str, float],
+) -> Regression:
+    held = tuple(c.name for c in spec.command if constants.get(c.name))
+    return regress(samples, spec, order, term_filter=partial(allowed, held=held))
 
 
 def _define_motion(
@@ -277,39 +313,42 @@ def select_textbook_terms(
         held: commands that had one value all the time, and therefore act as a constant.
         tyres: allows terms of the lateral acceleration, which makes tyres slip.
     """
+    names = spec.variable_names
     states = len(spec.state)
     allowed = select_motion_terms(powers, spec, held) & (powers.sum(axis=1) <= 1)
     structure = probe_structure(spec)
     if structure is None or not states:
         return np.asarray(allowed)
     moves, bicycle = structure
-    linear = np.eye(len(spec.variable_names), dtype=np.int64)
-    by_rate = {v.twist: linear[i] for i, v in enumerate(spec.state)}
-    speed = by_rate.get("vx", 0 * linear[0])
-    has_speed = bool(powers[:, speed > 0].any())  # else it never changed
-    is_held = np.array([command.name in held for command in spec.command])
-    for i, component in enumerate(v.twist for v in spec.state):
+    linear = np.eye(len(names), dtype=np.int64)
+    twist = [v.twist for v in spec.state]
+    # without it, the speed never changed
+    has_speed = "vx" in twist and bool(powers[:, twist.index("vx")].any())
+    is_held = np.array([name in held for name in names])
+
+    def allow(row: int, *terms: NDArray[np.int64]) -> None:
+        for term in terms:
+            allowed[row] |= (powers == term).all(axis=1)
+
+    for i, component in enumerate(twist):
         if component is None:
             continue
-        # no constant, because without a command the robot comes to rest
-        terms = [linear[i]]
-        is_moving = moves[POSE_RATES.index(component)] != 0.0
-        commands = linear[states:][is_moving]
+        row = FIRST_STATE + i
+        allowed[row] = False
         if tyres and has_speed and component != "vx":  # by the lateral acceleration
-            terms.append(2 * speed + by_rate["wz"])
+            allow(row, 2 * linear[twist.index("vx")] + linear[twist.index("wz")])
+        # no constant, because without a command the robot comes to rest
+        allow(row, linear[i])
+        is_moving = np.abs(moves[POSE_RATES.index(component)]) > 0.0
+        commands = linear[states:][is_moving]
         if bicycle.used and component == "wz" and has_speed:
-            terms += [speed, *(commands + speed)]
-        else:
-            terms += [*commands]
-            if is_held[is_moving].any():
-                terms.append(0 * linear[i])
-        allowed[FIRST_STATE + i] = select_listed(powers, terms)
+            speed = linear[twist.index("vx")]
+            allow(row, speed, *(commands + speed))
+            continue
+        allow(row, *commands)
+        if is_held[states:][is_moving].any():
+            allow(row, 0 * linear[i])
     return np.asarray(allowed)
-
-
-def select_listed(powers: Powers, terms: Sequence[Powers] | Powers) -> Mask:
-    """Selects the terms (K,) that are in a list (n, V)."""
-    return np.asarray((powers[:, None] == np.array(terms)).all(axis=2).any(axis=1))
 
 
 def select_terms_through_state(
@@ -349,20 +388,34 @@ def select_terms_through_state(
 def _select_textbook_twist(powers: Powers, spec: RobotSpec) -> Mask:
     """Selects the terms (3, K) by which the twist of a textbook can be expanded.
 
-    A variable that never moved, which is in none of the terms, is a constant factor. A trim, a
-    wheel that steers a little to one side, leaves an angle out of a term.
+    A variable that never moved, which is in none of the terms, is a constant factor.
     """
     never_moved = ~powers.any(axis=0)
-    is_angle = [variable.unit == "rad" for variable in spec.state]
-    angles = np.eye(len(spec.state), dtype=np.int64)[is_angle]
-    allowed = []
+    allowed = np.zeros((3, len(powers)), dtype=np.bool_)
+    for row, expansion in zip(allowed, _expand_textbook_twist(spec), strict=True):
+        for term in expansion:
+            row |= (powers == np.where(never_moved, 0, term)).all(axis=1)
+    return allowed & powers.any(axis=1)
+
+
+def _expand_textbook_twist(spec: RobotSpec) -> tuple[tuple[Array, ...], ...]:
+    """Returns the terms (V,) of the expanded twist of a textbook, and those of a trim, by part.
+
+    A trim, a wheel that steers a little to one side, leaves an angle out of a term.
+    """
+    commands = np.zeros(len(spec.command), dtype=np.int64)
+    alone = np.eye(len(spec.state), dtype=np.int64)
+    expansions = []
     for terms in _expand_twist_by_state(spec):
-        trims = [term - angle for term in terms for angle in angles if term @ angle]
-        by_state = np.array([*terms, *trims]).reshape(-1, len(spec.state))
-        expansion = np.pad(by_state, ((0, 0), (0, len(spec.command))))
-        listed = np.where(never_moved, 0, expansion)
-        allowed.append(select_listed(powers, listed))
-    return np.array(allowed) & powers.any(axis=1)
+        trims = [
+            term - alone[factor]
+            for term in terms
+            for factor in np.flatnonzero(term)
+            if spec.state[factor].unit == "rad"
+        ]
+        both = (*terms, *trims)
+        expansions.append(tuple(np.append(term, commands) for term in both))
+    return tuple(expansions)
 
 
 def _expand_twist_by_state(spec: RobotSpec) -> list[Powers]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,9 +10,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, Response, require_state
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.fit import prune_and_refit, regress
 from nics_drl_bridge.identify.signals import infer_states, list_followed_commands
-from nics_drl_bridge.identify.terms import select_listed
 from nics_drl_bridge.identify.verdict import Gap
 from nics_drl_bridge.identify.yardstick import (
     LIMIT_RANGE,
@@ -23,10 +20,9 @@ from nics_drl_bridge.identify.yardstick import (
 )
 from nics_drl_bridge.recording.recording import Samples, Stream
 from nics_drl_bridge.robot.curve import InputCurve
-from nics_drl_bridge.robot.kernels import MAX_ORDER
 from nics_drl_bridge.robot.kinds import Textbook, has_textbook, reach, textbook
 from nics_drl_bridge.robot.spec import POSE_RATES, CommandVariable, RobotSpec
-from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.robot.taylor import TaylorModel, evaluate
 
 Powers = NDArray[np.int64]
 
@@ -34,7 +30,7 @@ Powers = NDArray[np.int64]
 MARGIN = 1.25
 LEAST_COSINE = 0.1  # minimum cosine of a steering angle
 WIDEST_ANGLE = 1.4  # maximum angle of a steered wheel in the expansion [rad]
-PRUNING = 0.9995  # threshold (Eq. 2) for the terms of the expansion
+NEGLIGIBLE = 1e-3  # fraction of a rate below which a term of the expansion is left out
 # fraction of the widest searched range above which a limit counts as not found
 UNLIMITED = 0.5
 
@@ -81,39 +77,58 @@ def make_textbook_model(
     share = -np.expm1(-model.dt / relation.lag_s)
     rates = (relation.goal - states) * share / model.dt
     targets = np.concatenate([relation.twist, rates], axis=1)
-    allowed = partial(_select_terms, pair=relation.pair)
-    regression = regress(
-        replace(samples, dq=targets), spec, MAX_ORDER, term_filter=allowed
+    allowed = _list_terms(relation, samples.x.shape[1], len(targets.T))
+    pairs = zip(targets.T, allowed, strict=True)
+    powers, coefficients = _join_terms(
+        [_expand(samples.x, target, powers) for target, powers in pairs]
     )
-    fit = prune_and_refit(regression, spec, PRUNING, with_errors=False)
     limits = np.tile([-np.inf, np.inf], (len(spec.state), 1))
     limits[relation.is_speed] = _find_speed_limits(response)
-    return replace(
-        fit.model,
+    return TaylorModel(
+        spec.variable_names,
+        spec.dof_names,
+        spec.dof_units,
+        powers=powers,
+        coefficients=coefficients,
         dt=model.dt,
+        low=samples.x.min(axis=0),
+        high=samples.x.max(axis=0),
         bounded=model.bounded,
         inputs=tuple(_find_dead_zones(response, spec)),
         limits=limits,
     )
 
 
-def _select_terms(
-    powers: Powers, spec: RobotSpec, pair: tuple[int, int] | None
-) -> NDArray[np.bool_]:
-    """Selects the terms (D, K) of a textbook: linear, but for the speed and angle of a bicycle."""
-    allowed = np.tile(powers.sum(axis=1) <= 1, (len(spec.dof_names), 1))
-    if pair is None:
-        return allowed
-    linear = np.eye(powers.shape[1], dtype=np.int64)
-    v, steer = (linear[place] for place in pair)
-    turns = [v, v + steer, v + 2 * steer, v + 3 * steer]
-    expansions = {
-        0: [v, v + 2 * steer],
-        2: [*turns, 2 * v, 2 * v + steer, 3 * v + steer],
-    }
-    for dof, expansion in expansions.items():
-        allowed[dof] = select_listed(powers, expansion)
+def _list_terms(relation: "_Relation", variables: int, dofs: int) -> list[Powers]:
+    """Returns the terms (K, V) that each degree of freedom may have: linear, but for a bicycle."""
+    linear = np.eye(variables, dtype=np.int64)
+    allowed = [np.concatenate([0 * linear[:1], linear])] * dofs
+    if relation.pair is not None:
+        v, steer = (linear[place] for place in relation.pair)
+        allowed[0] = np.array([v, v + 2 * steer])
+        turns = [v, v + steer, v + 2 * steer, v + 3 * steer]
+        allowed[2] = np.array([*turns, 2 * v, 2 * v + steer, 3 * v + steer])
     return allowed
+
+
+def _expand(x: Array, target: Array, allowed: Powers) -> tuple[Powers, Array]:
+    """Returns the terms (K, V), and their coefficients, that approximate a target (T,) on rows."""
+    chi = evaluate(x, allowed)
+    size = np.maximum(np.linalg.norm(chi, axis=0), 1e-12)
+    beta = np.linalg.lstsq(chi / size, target, rcond=1e-9)[0]
+    shown = np.abs(beta) > NEGLIGIBLE * max(float(np.linalg.norm(target)), 1e-12)
+    beta = np.linalg.lstsq((chi / size)[:, shown], target, rcond=1e-9)[0]
+    return allowed[shown], beta / size[shown]
+
+
+def _join_terms(expansions: list[tuple[Powers, Array]]) -> tuple[Powers, Array]:
+    """Returns the terms (K, V) of all degrees of freedom, and their coefficients (D, K)."""
+    powers = np.unique(np.concatenate([rows for rows, _ in expansions]), axis=0)
+    coefficients = np.zeros((len(expansions), len(powers)))
+    for d, (rows, values) in enumerate(expansions):
+        place = (powers == rows[:, None]).all(axis=2).argmax(axis=1)
+        coefficients[d, place] = values
+    return powers, coefficients
 
 
 class _Relation(NamedTuple):

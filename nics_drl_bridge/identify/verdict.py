@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import FitError
+from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.calibration import Calibration, name_sum
+from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import TimingEstimate
-from nics_drl_bridge.identify.drive import MAX_GAP_S, Drive, Settings
+from nics_drl_bridge.identify.drive import MAX_GAP_S, Drive
 from nics_drl_bridge.identify.findings import (
     Findings,
     require_fit,
@@ -24,6 +24,7 @@ from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.open_loop import (
     HORIZON_S,
     OpenLoop,
+    measure_open_loop_error,
     predict,
     select_windows,
 )
@@ -60,12 +61,6 @@ SPACING_OF_RECORDING_S = 0.5
 # ratio to the errors of the other recordings from which one is reported as off
 ALONE = 2.5
 LEAST_SHARE = 0.02  # fraction of the path below which errors are ignored
-
-
-TOO_SHORT = (
-    "The training part is too short to refine the model by its errors over seconds; record a "
-    "longer drive."
-)
 
 
 class Gap(str):
@@ -280,6 +275,11 @@ def _describe_wheels(calibration: Calibration) -> Iterator[str]:
         yield f"Left and right wheel look interchanged: the wheel recorded as the left one {why}."
 
 
+def name_sum(state: str) -> str:
+    """Returns the name of the uncertainty of a latency and a lag together."""
+    return f"command_latency_and_{state}_lag_s"
+
+
 def describe_sums(calibration: Calibration) -> Iterator[str]:
     """Yields a sentence on latencies and lags that could not be separated."""
     commands = [response.command for response in calibration.responses]
@@ -449,6 +449,16 @@ def describe_mirror_image(
         return
 
 
+def try_model(
+    model: TaylorModel, calibration: Calibration, drive: Drive, t: float
+) -> OpenLoop | None:
+    """Tries a model on a drive from t [s] on; None if the rest is too short."""
+    try:
+        return measure_open_loop_error(model, calibration, drive, t, drive.duration_s)
+    except RecordingError:
+        return None
+
+
 def is_worse(error_m: float, reference_m: float) -> bool:
     """True if an error [m] clearly exceeds a reference [m], or is not a number."""
     return bool(np.isnan(error_m)) or error_m > WORSE * reference_m
@@ -521,27 +531,6 @@ def describe_replacement(lost: HorizonErrors) -> str:
     written = "the model written is the textbook, fitted to the training part"
     bias = "since these data chose it, its errors on them are slightly optimistic"
     return f"{finding}: {written}; {bias}."
-
-
-def describe_refinement(horizon_s: float) -> str:
-    """States the longest horizon of the predictions [s]; 0 if none fitted into the drive."""
-    if horizon_s == 0.0:
-        return TOO_SHORT
-    by = f"the open-loop errors over up to {horizon_s:g} s"
-    return f"Coefficients and calibration were refined by {by}."
-
-
-def list_unused_options(
-    settings: Settings, is_motion: bool, has_order: bool
-) -> Iterator[str]:
-    """Yields a sentence per option that had no effect on a model found by predictions."""
-    if settings.alpha != "auto" and is_motion:
-        why = "where the state is the motion, or there is none, predictions weight the terms"
-        yield f"alpha = {settings.alpha:g} was not used: {why}."
-    if settings.order != "auto" and not has_order:
-        off = f"more than {WORSE:g} times as far off as the textbook's, or diverge"
-        why = f"predictions with its terms are {off}, so only the textbook's were kept"
-        yield f"order = {settings.order} was not used: {why}."
 
 
 def describe_refit(until: float, duration: float, worse: bool) -> str:

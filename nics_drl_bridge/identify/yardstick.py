@@ -13,6 +13,7 @@ from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import (
     Calibration,
+    choose_half_width,
     measure_body_twists,
 )
 from nics_drl_bridge.identify.drive import Drive
@@ -70,19 +71,23 @@ class Yardstick:
     response: TextbookResponse
     clock_offset_s: float  # added to the pose's stamps to give the commands' clock
 
-    def predict(self, drive: Drive, chosen: Windows) -> Array:
-        """Predicts poses (W, 3) at windows' ends from twists at their starts."""
+    def predict(
+        self, drive: Drive, chosen: Windows, twist: Array | None = None
+    ) -> Array:
+        """Predicts poses (W, 3) at windows' ends from twists (W, 3) at their starts, if known."""
         duration = (chosen.end_t - chosen.start_t)[:, None]
         course = _sample_commands(drive, chosen.start_t + self.clock_offset_s, duration)
-        twist = estimate_twists_at(drive, chosen.start_t)
+        twist = estimate_twists_at(drive, chosen.start_t) if twist is None else twist
         return geometry.compose(
             chosen.start, _predict_ends(self.response, course, twist)[:, 0]
         )
 
 
-def predict_kept_twist(drive: Drive, chosen: Windows) -> Array:
+def predict_kept_twist(
+    drive: Drive, chosen: Windows, twist: Array | None = None
+) -> Array:
     """Predicts poses (W, 3) at windows' ends for a robot that keeps the twist at their starts."""
-    twist = estimate_twists_at(drive, chosen.start_t)
+    twist = estimate_twists_at(drive, chosen.start_t) if twist is None else twist
     moved = twist * (chosen.end_t - chosen.start_t)[:, None]
     return geometry.compose(chosen.start, geometry.exp(moved))
 
@@ -101,7 +106,7 @@ def estimate_twists_at(drive: Drive, at: Array) -> Array:
 def _measure_twists(drive: Drive) -> tuple[Array, Array]:
     """Returns uniform times (T,) on the pose's clock, and twists (T, 3) of the tracked body."""
     t = drive.dated.t
-    width = drive.half_width_s
+    width = choose_half_width(drive)
     count = max(int((t[-1] - t[0]) / STEP_S), MIN_GRID)
     grid = np.linspace(t[0], t[-1], count + 1)
     return grid, measure_body_twists(drive, Calibration(), grid, width)
@@ -166,58 +171,65 @@ def _rotate_twists(twist: Array, angle: float) -> Array:
 
 @dataclass(frozen=True)
 class _Form:
-    """Values of an initial response in one vector, and which of these are free."""
+    """An initial response, and which of its values are free."""
 
-    values: Array  # (P,): delay, gains, offsets, logs of lags and limits, understeer, mounting
-    free: NDArray[np.bool_]  # (P,)
-    bicycle: BicycleGeometry
+    start: TextbookResponse
+    moves: NDArray[np.bool_]  # (3, C) commands that an actuator follows
+    mounted: NDArray[np.bool_]  # (3,) free values of the mounting
     # True if acceleration and deceleration have the same limit
     one_limit: bool = False
 
-    @classmethod
-    def around(
-        cls,
-        start: TextbookResponse,
-        moves: NDArray[np.bool_],
-        mounted: NDArray[np.bool_],
-    ) -> "_Form":
-        """Starts at a response; `moves` (3, C) are the commands that actuators follow.
-
-        `mounted` (3,) are the free values of the mounting.
-        """
-        bicycle = start.bicycle
-        follows = moves.any(axis=1)
-        parts = [
-            (start.delay_s, True),
-            (start.gain, moves),
-            (start.offset, follows),
-            (np.log(start.lag_s), follows),
-            (np.log(start.limit), [True, True]),
-            (bicycle.understeer, bicycle.used and not bicycle.front_drive),
-            (start.mounting, mounted),
-        ]
-        values, free = (
-            np.concatenate([np.ravel(part) for part in column])
-            for column in zip(*parts, strict=True)
+    def list_free(self) -> tuple[NDArray[np.bool_], ...]:
+        """Returns masks of the free values, in the order of `_flatten`."""
+        bicycle = self.start.bicycle
+        follows = np.asarray(self.moves.any(axis=1))
+        return (
+            np.array([True]),
+            self.moves,
+            follows,
+            follows,
+            np.array([True, not self.one_limit]),
+            np.array([bicycle.used and not bicycle.front_drive]),
+            self.mounted,
         )
-        return cls(values, free.astype(np.bool_), bicycle)
+
+    def pack(self) -> Array:
+        """Returns the free values of the start (P,)."""
+        pairs = zip(_flatten(self.start), self.list_free(), strict=True)
+        return np.concatenate([values[free] for values, free in pairs])
 
     def unpack(self, theta: Array) -> TextbookResponse:
-        """Returns the response for free values (n,)."""
-        values = self.values.copy()
-        values[self.free] = theta
-        ends = np.cumsum([1, len(values) - 13, 3, 3, 2, 1])
-        delay, gain, offset, lag, limit, understeer, mounting = np.split(values, ends)
-        limit = np.exp(np.clip(limit, *np.log(LIMIT_RANGE)))
+        """Returns the response for free values (P,)."""
+        values = _flatten(self.start)
+        begin = 0
+        for value, free in zip(values, self.list_free(), strict=True):
+            end = begin + int(free.sum())
+            value[free] = theta[begin:end]
+            begin = end
+        delay, gain, offset, log_lag, log_limit, understeer, mounting = values
+        limit = np.exp(np.clip(log_limit, *np.log(LIMIT_RANGE)))
         return TextbookResponse(
             float(delay[0]),
-            gain.reshape(3, -1),
+            gain,
             offset,
-            np.exp(np.clip(lag, *np.log(LAG_RANGE_S))),
-            limit[[0, 0]] if self.one_limit else limit,
-            self.bicycle._replace(understeer=float(understeer[0])),
+            np.exp(np.clip(log_lag, *np.log(LAG_RANGE_S))),
+            np.full(2, limit[0]) if self.one_limit else limit,
+            self.start.bicycle._replace(understeer=float(understeer[0])),
             mounting,
         )
+
+
+def _flatten(response: TextbookResponse) -> tuple[Array, ...]:
+    """Returns copies of the values of a response; positive ones as logarithms."""
+    return (
+        np.array([response.delay_s]),
+        response.gain.copy(),
+        response.offset.copy(),
+        np.log(response.lag_s),
+        np.log(response.limit),
+        np.array([response.bicycle.understeer]),
+        response.mounting.copy(),
+    )
 
 
 def probe_structure(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
@@ -275,12 +287,10 @@ def _guess_response(
     seen = select_windows(drive, Calibration(), 0.0, until_s, GUESS_S, SPACING_S)
     motion = _MeanMotion.over(drive, seen)
     guesses = []
-    recording = drive.recording
-    one_clock = recording.command.clock == recording.pose.clock
-    for delay in (DELAYS_S if one_clock else FAR_DELAYS_S).tolist():
+    for delay in _list_delays(drive):
         start = seen.start_t + (clock_offset - delay)
         end = seen.end_t + (clock_offset - delay)
-        u = average_held(recording.command, drive.spec, start, end)
+        u = average_held(drive.recording.command, drive.spec, start, end)
         rotation = 0.0
         if structure is not None:
             rotation = _find_rotation(u @ book.T, motion.twist)
@@ -293,7 +303,15 @@ def _guess_response(
     response = TextbookResponse(delay, gain, offset, lag, limit, bicycle, place)
     # Unequal wheels look like a lateral lever arm; without a textbook, any gain may be one.
     mounted = np.array([True, np.count_nonzero(book[0]) < 2, True])
-    return _Form.around(response, book != 0.0, mounted & (structure is not None))
+    return _Form(response, book != 0.0, mounted & (structure is not None))
+
+
+def _list_delays(drive: Drive) -> list[float]:
+    """Returns the delays [s] at which gains and lags are guessed."""
+    recording = drive.recording
+    one_clock = recording.command.clock == recording.pose.clock
+    delays: list[float] = (DELAYS_S if one_clock else FAR_DELAYS_S).tolist()
+    return delays
 
 
 class _MeanMotion(NamedTuple):
@@ -417,7 +435,7 @@ def _search(form: _Form, motions: _Motions) -> tuple[float, TextbookResponse]:
         rates = np.clip(error / motions.course.duration[..., None], -100.0, 100.0)
         return np.asarray(np.nan_to_num(rates)).ravel()
 
-    theta = form.values[form.free]
+    theta = form.pack()
     solution = scipy.optimize.least_squares(
         residuals,
         theta,

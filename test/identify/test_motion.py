@@ -10,17 +10,19 @@ from scipy.signal import savgol_filter
 
 from identify.drives import fit_trial, slipping_car
 from nics_drl_bridge.identify.calibration import (
+    WIDTHS_S,
     Calibration,
     add_motion,
-    align,
+    choose_half_width,
     find_slopes,
     has_motion_as_state,
     make_motion_grid,
     make_surrogate,
     require_state,
+    resample_motion,
     smooth_commands,
 )
-from nics_drl_bridge.identify.drive import WIDTHS_S, Drive
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import build_robot, load_robot
@@ -51,13 +53,15 @@ def test_a_twist_that_was_not_measured_is_taken_from_the_pose(drive, car):
 
 
 def test_noisier_poses_are_smoothed_over_longer(drive):
-    assert drive.half_width_s == WIDTHS_S[0]
+    assert choose_half_width(drive) == WIDTHS_S[0]
     noise = np.random.default_rng(0).normal(
         0.0, 0.01, drive.recording.pose.values.shape
     )
     pose = replace(drive.recording.pose, values=drive.recording.pose.values + noise)
-    noisier = Drive(replace(drive.recording, pose=pose), drive.spec)
-    assert noisier.half_width_s > WIDTHS_S[0]
+    assert (
+        choose_half_width(Drive(replace(drive.recording, pose=pose), drive.spec))
+        > WIDTHS_S[0]
+    )
 
 
 @pytest.mark.parametrize(
@@ -86,7 +90,7 @@ def test_the_twist_is_that_of_the_base_wherever_the_tracked_body_sits(drive):
 def test_samples_have_the_commands_in_effect_after_their_latency(drive):
     late = replace(MOUNTED, command_latency_s=0.1)
     grid = make_motion_grid(drive, late, 0.1)
-    at = align(add_motion(drive, late, grid, 0.07), late, 0.07)
+    at = resample_motion(add_motion(drive, late, grid, 0.07), late, 0.07)
     command = drive.recording.command
     row = 500
     before = np.searchsorted(command.t, at.t[row] - 0.1 + 1e-9, "right") - 1

@@ -11,6 +11,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import (
     predict,
+    predict_along_states,
     select_windows,
 )
 
@@ -31,7 +32,7 @@ def windows(request):
 def test_predictions_along_exact_states_end_where_those_from_the_start_do(windows):
     model, driven, chosen = windows
     ends = predict(model, MOUNTING, driven, chosen)[:-1]  # no state follows the last
-    along = predict(model, MOUNTING, driven, chosen, along_states=True)[:-1]
+    along = predict_along_states(model, MOUNTING, driven, chosen)[:-1]
     assert along == pytest.approx(ends, abs=1e-6)
 
 
@@ -40,7 +41,7 @@ def test_predictions_along_states_are_not_bent_by_what_the_model_gets_wrong(wind
     coefficients = model.coefficients.copy()
     coefficients[3:] *= 0.5
     wrong = replace(model, coefficients=coefficients)
-    along = predict(wrong, MOUNTING, driven, chosen, along_states=True)
-    right = predict(model, MOUNTING, driven, chosen, along_states=True)
+    along = predict_along_states(wrong, MOUNTING, driven, chosen)
+    right = predict_along_states(model, MOUNTING, driven, chosen)
     assert along == pytest.approx(right, abs=1e-12)
     assert np.abs(predict(wrong, MOUNTING, driven, chosen) - right).max() > 0.01

@@ -13,6 +13,7 @@ from nics_drl_bridge.identify.shooting import (
     Parameters,
     Shooting,
     fit_to_predictions,
+    predict_along_path,
 )
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
@@ -81,7 +82,7 @@ def test_coefficients_and_a_delay_are_found_together(car, problem):
     assert found.model.coefficients[free] == pytest.approx(
         car.coefficients[free], rel=0.02
     )
-    assert found.parameters.start[0] == pytest.approx(DELAY, abs=0.003)
+    assert found.values[0] == pytest.approx(DELAY, abs=0.003)
     assert found.errors["latency"] < 0.01
 
 
@@ -109,17 +110,16 @@ def test_windows_that_are_predicted_together_end_as_each_alone(car, problem):
     assert (slope[steps > 0] != 0.0).any(axis=(0, 1)).all()
 
 
-def test_states_that_are_known_all_along_move_a_robot_as_those_that_it_reaches(
-    car, problem
-):
+def test_one_path_gives_the_windows_of_states_that_are_known_all_along(car, problem):
     first, steps = problem.list_windows()
     later = first > DELAY / DT
     first = first[later]
     steps = steps[later]
     free = np.zeros(car.coefficients.shape, dtype=np.bool_)
     free[:3] = True
-    known = replace(problem, inferred=lambda at: problem.samples.q[:, 3:])
-    end, slope = known.predict(car, np.array([DELAY]), first, steps, free)
+    command = problem.commands({"latency": DELAY})
+    x = np.concatenate([problem.samples.q[:, 3:], command], axis=1)
+    end, slope = predict_along_path(car, x, first, steps, free)
     ends, slopes = problem.predict(car, np.array([DELAY]), first, steps, free)
     assert end == pytest.approx(ends, abs=1e-9)
     assert slope == pytest.approx(slopes, abs=1e-9)
@@ -167,7 +167,7 @@ def test_nothing_free_leaves_the_model(car, problem):
     problem = replace(problem, parameters=fixed)
     found = fit_to_predictions(problem, car, np.zeros((6, 4), dtype=np.bool_))
     assert np.array_equal(found.model.coefficients, car.coefficients)
-    assert np.sqrt(np.mean(found.search.measure_errors(found.theta) ** 2)) < 0.005
+    assert np.sqrt(np.mean(found.residual**2)) < 0.005
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")

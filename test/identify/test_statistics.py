@@ -12,6 +12,7 @@ from nics_drl_bridge.identify.statistics import (
     cross_validated,
     estimate_clustered_errors,
     estimate_standard_errors,
+    find_correlation_reach,
     find_knee,
     minimise_robustly,
 )
@@ -109,6 +110,7 @@ def test_errors_grow_with_residuals_that_resemble_their_neighbours():
     residual = lfilter([1.0], [1.0, -0.95], rng.normal(size=4000))
     plain = residual.std() * np.sqrt(1.0 / (chi.T @ chi)[0, 0])
     assert estimate_standard_errors(chi, residual)[0] > 3.0 * plain
+    assert find_correlation_reach(residual) > 40
 
 
 def test_the_condition_number_does_not_depend_on_units():

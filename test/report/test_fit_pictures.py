@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge import generator
-from nics_drl_bridge.identify.effects import Evidence
+from nics_drl_bridge.identify.hypotheses import Base, Draft
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.report import collect_estimates, format_report
-from nics_drl_bridge.identify.selection import Base, Draft
 from nics_drl_bridge.identify.terms import Kind, Library
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report import fit_pictures as pictures
@@ -92,7 +91,7 @@ def test_a_short_drive_has_fewer_pictures(found, blank):
 def predicted(identified, kind: Kind):
     """The result of a drive whose terms predictions chose from a kind of library."""
     library = Library(identified.drive.spec, kind, True, "auto", 3)
-    draft = Draft(Evidence(None, None, None, library), problem=None)
+    draft = Draft(library, form=None, problem=None)
     base = Base(draft, found=None)
     return replace(identified, findings=replace(identified.findings, base=base))
 

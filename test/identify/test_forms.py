@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,28 +11,21 @@ from scipy.signal import lfilter
 
 from identify.drives import make_model, slipping_car, throttle_car
 from nics_drl_bridge.identify.drive import Drive, Settings
-from nics_drl_bridge.identify.effects import (
+from nics_drl_bridge.identify.findings import Findings, resample_drive
+from nics_drl_bridge.identify.forms import (
     Evidence,
-    actuate,
+    Form,
+    add_dead_zones,
+    add_reverse_gains,
     drop_unreached_ends,
     find_input_curve,
-    find_latency,
-    find_likely_delay,
-    list_curve_rows,
-    list_dead_zone_rows,
-    list_delay_rows,
-    list_drag_rows,
-    list_friction_rows,
-    list_limit_rows,
-    list_plain_rows,
-    list_reverse_rows,
-    make_curves,
-    make_parameters,
+    find_two_way_curves,
+    list_parameters,
     make_prediction_problem,
 )
-from nics_drl_bridge.identify.findings import Findings, resample_drive
 from nics_drl_bridge.identify.identify import (
     STAGES,
+    Identified,
     find_input_curves,
     run,
 )
@@ -89,19 +83,10 @@ def test_a_command_that_does_not_drive_a_robot_has_no_curve_by_its_speed(
     assert find_input_curve(slower, found.training.spec, 1) is None
 
 
-def list_all_rows(evidence: Evidence) -> dict:
-    """Returns the rows of a model with all effects of a throttle and a speed."""
-    return (
-        list_plain_rows(evidence, (CURVE,))
-        | list_friction_rows(evidence, "vx")
-        | list_drag_rows(evidence, "vx")
-        | list_limit_rows(evidence, "vx")
-    )
-
-
 def test_values_are_sought_by_name_from_what_the_motion_shows(evidence):
-    sought = make_parameters(list_all_rows(evidence))
-    assert set(sought.names) == {
+    form = Form((CURVE,), friction=("vx",), limits=("vx",), drag=("vx",))
+    sought = list_parameters(evidence, form)
+    assert sought.names == (
         "latency",
         "throttle.dead",
         "throttle.least",
@@ -111,32 +96,30 @@ def test_values_are_sought_by_name_from_what_the_motion_shows(evidence):
         "vx.back_emf.throttle",
         "vx.fall",
         "vx.rise",
-    }
+    )
     assert len(sought.sought) == len(sought.names)
     assert (sought.low <= sought.start).all()
     assert (sought.start <= sought.high).all()
 
 
-def test_a_model_that_grows_starts_where_the_smaller_one_ended(evidence):
-    rows = list_plain_rows(evidence, (CURVE,))
-    small = make_parameters(rows)
+def test_a_form_that_grows_starts_where_the_smaller_one_ended(evidence):
+    small = list_parameters(evidence, Form((CURVE,)))
     ended = replace(small, start=small.start + np.array([0.02, 0.01, 0.0, 0.03]))
-    grown = make_parameters(rows | list_drag_rows(evidence, "vx")).start_from(ended)
-    assert grown.start[:4] == pytest.approx(ended.start)
-    assert grown.start[4] > 0.0
+    larger = list_parameters(evidence, Form((CURVE,), drag=("vx",))).start_from(ended)
+    assert larger.start[:4] == pytest.approx(ended.start)
+    assert larger.start[4] > 0.0
 
 
 def test_the_least_delay_of_the_commands_is_their_latency(evidence):
-    rows = list_plain_rows(evidence, (CURVE,)) | list_delay_rows(evidence)
-    sought = make_parameters(rows)
-    assert sought.names[0] == "latency"
-    assert sought.names[-2:] == ("throttle.delay", "steering.delay")
+    form = Form((CURVE,), delays=(("throttle", 0.08), ("steering", 0.02)))
+    sought = list_parameters(evidence, form)
+    assert sought.names[:3] == ("latency", "throttle.delay", "steering.delay")
     assert 0 not in sought.sought
-    at = sought.name(sought.start) | {"throttle.delay": 0.08, "steering.delay": 0.02}
-    assert find_latency(at) == 0.02
-    (curve,) = make_curves(evidence.drive.spec, at)
+    at = sought.name(sought.start)
+    assert form.find_latency(at) == 0.02
+    (curve,) = form.make_curves(at)
     assert (curve.command, curve.delay) == ("throttle", pytest.approx(0.06))
-    problem = make_prediction_problem(evidence, sought)
+    problem = make_prediction_problem(evidence, form, sought)
     delayed = problem.commands(at)
     alike = problem.commands(at | {"throttle.delay": 0.02})
     step = round(0.06 / evidence.samples.dt)
@@ -144,43 +127,43 @@ def test_the_least_delay_of_the_commands_is_their_latency(evidence):
     assert np.array_equal(delayed[:, 1], alike[:, 1])
 
 
-def test_a_latency_is_seen_in_a_motion_that_comes_later(evidence):
-    drive = evidence.drive
-    command = replace(drive.recording.command, t=drive.recording.command.t - 0.2)
-    later = drive.part(replace(drive.recording, command=command))
-    at_once, late = (
-        find_likely_delay(each, evidence.calibration, evidence.samples)
-        for each in (drive, later)
-    )
-    assert late - at_once == pytest.approx(0.2, abs=0.021)
-
-
 def test_values_become_curves_friction_limits_and_drag(evidence):
+    form = Form((CURVE,), ("vx",), ("vx",), ("throttle",), ("vx",))
+    sought = list_parameters(evidence, form)
+    values = np.array([0.03, 0.12, -0.2, 0.4, 0.8, 0.25, 0.15, 1.2, 3.0, 2.0])
+    at = sought.name(values)
+    (curve,) = form.make_curves(at)
+    assert curve == InputCurve(
+        command="throttle", dead=0.12, least=-0.2, most=0.4, back=0.8
+    )
     spec = evidence.drive.spec
-    curve = {"dead": 0.12, "least": -0.2, "most": 0.4, "back": 0.8}
-    at = {"latency": 0.03} | {f"throttle.{part}": curve[part] for part in curve}
-    assert make_curves(spec, at) == (InputCurve(command="throttle", **curve),)
-    at |= {"vx.friction": 0.25, "vx.drag": 0.15, "vx.back_emf.throttle": 1.2}
-    at |= {"vx.fall": 3.0, "vx.rise": 2.0}
-    model = actuate(spec, make_model(spec, {"vx": {"vx": 1.0}}), at)
+    model = form.actuate(make_model(spec, {"vx": {"vx": 1.0}}), at)
     assert model.friction.tolist() == [0.25, 0.0, 0.0]
     assert model.drag.tolist() == [0.15, 0.0, 0.0]
     assert model.back_emf[0].tolist() == [1.2, 0.0]
     assert model.limits[0].tolist() == [-3.0, 2.0]
 
 
-def test_a_dead_zone_starts_small_and_may_be_none(evidence):
-    start, _, low, high = list_dead_zone_rows(evidence, "throttle")["throttle.dead"]
-    assert 0.0 == low < start < 0.05 < high
+def test_a_dead_zone_is_tried_of_the_command_that_drives_alone(evidence):
+    (curve,) = add_dead_zones(Form(), evidence).curves
+    assert curve.command == "throttle"
+    assert 0.0 < curve.dead < 0.05
+    assert add_dead_zones(Form((CURVE,)), evidence).curves == (CURVE,)
+    assert add_reverse_gains(add_dead_zones(Form(), evidence), (curve,)).back == (
+        "throttle",
+    )
 
 
 def test_only_a_command_that_drives_both_ways_may_have_a_gain_of_its_own_backwards(
     evidence,
 ):
-    neutral = list_curve_rows(InputCurve(command="throttle", least=-0.3, most=0.6))
-    assert set(list_reverse_rows(evidence)) == {*neutral, "throttle.back"}
+    (both,) = find_two_way_curves(evidence)
+    assert both.command == "throttle"
+    form = add_reverse_gains(Form(), (both,))
+    assert form.back == ("throttle",)
+    assert len(list_parameters(evidence, form).sought) == 4  # it has no dead zone
     forwards = replace(evidence.samples, x=np.abs(evidence.samples.x))
-    assert list_reverse_rows(replace(evidence, samples=forwards)) == {}
+    assert find_two_way_curves(replace(evidence, samples=forwards)) == ()
 
 
 def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, samples):
@@ -206,3 +189,18 @@ def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, sample
     assert within.inputs[0].most == pytest.approx(0.8 * sent.max())
     assert within.inputs[0].least == -np.inf
     assert within.limits[0].tolist() == [-np.inf, 0.5 * asked.max()]
+
+
+def test_the_dead_zone_of_a_steering_is_none_of_the_drive():
+    spec = throttle_car()
+    inputs = (
+        InputCurve(command="throttle", dead=0.1),
+        InputCurve(command="steering", dead=0.3),
+    )
+    terms = {"d_vx": {"throttle": 9.0}, "d_wz": {"steering": 9.0}}
+    model = make_model(spec, terms, inputs=inputs)
+    found = SimpleNamespace(model=model, drive=SimpleNamespace(spec=spec))
+    assert Identified.dead_zone.fget(found) == 0.1
+    rubbing = replace(model, friction=np.array([0.9, 0.0, 9.0]))
+    found.model = rubbing
+    assert Identified.dead_zone.fget(found) == pytest.approx(0.2)

@@ -17,17 +17,9 @@ from identify.drives import (
     throttle_car,
 )
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.effects import Evidence
 from nics_drl_bridge.identify.findings import resample_drive
-from nics_drl_bridge.identify.identify import (
-    STAGES,
-    fit_terms,
-    identify,
-    make_library,
-    run,
-)
-from nics_drl_bridge.identify.report import format_report
-from nics_drl_bridge.identify.selection import (
+from nics_drl_bridge.identify.forms import Evidence, Form
+from nics_drl_bridge.identify.hypotheses import (
     Draft,
     Trial,
     choose_trial,
@@ -37,6 +29,9 @@ from nics_drl_bridge.identify.selection import (
     list_candidates,
     list_hypotheses,
 )
+from nics_drl_bridge.identify.identify import STAGES, fit_terms, identify, run
+from nics_drl_bridge.identify.prediction_fit import make_library
+from nics_drl_bridge.identify.report import format_report
 from nics_drl_bridge.identify.shooting import Parameters, Shooting
 from nics_drl_bridge.identify.terms import Kind, Library
 
@@ -55,7 +50,7 @@ def test_a_car_without_drag_and_friction_is_given_none():
     assert values.get("throttle.dead", 0.0) < 0.01
     assert values.get("vx.friction", 0.0) < 0.05
     assert values.get("vx.drag", 0.0) < 0.02
-    assert "vx.rise" not in values
+    assert base.draft.form.limits == ()
 
 
 @pytest.mark.slow
@@ -69,8 +64,10 @@ def test_a_car_that_slips_shows_its_effects_is_predicted_and_its_lever_is_not_be
     assert abs(found.calibration.lever_arm_m[0] - 0.08) < 3.0 * sigma["lever_arm_x_m"]
     assert abs(found.calibration.rotation_rad + 0.1) < 3.0 * sigma["rotation_rad"]
     assert "command_latency_s" not in sigma
+    form = found.findings.base.draft.form
     values = found.findings.base.found.named
-    assert {"tyres", "vx.drag", "vx.friction"} <= set(values)
+    assert form.tyres
+    assert form.drag == form.friction == ("vx",)
     assert values["throttle.dead"] == pytest.approx(0.1, abs=0.01)
     assert values["vx.friction"] == pytest.approx(0.3, abs=0.1)
     assert 0.0 < sigma["throttle.dead"] < 0.02
@@ -114,8 +111,7 @@ def test_no_weaker_pull_is_tried_of_an_order_that_got_worse_by_the_last(monkeypa
     monkeypatch.setattr(Draft, "list_folds", lambda draft, orders: iter(()))
     monkeypatch.setattr(Draft, "try_hypothesis", tried)
     nothing = Parameters((), *np.zeros((4, 0)))
-    evidence = Evidence(None, None, None, MOTION)
-    draft = Draft(evidence, Shooting(None, nothing, None, None, None))
+    draft = Draft(MOTION, Form(), Shooting(None, nothing, None, None, None))
     asked = (*errors, (1, 0.001))
     asked = tuple(sorted(asked, key=lambda each: (each[0], -each[1])))
     trials = draft.cross_validate(asked)

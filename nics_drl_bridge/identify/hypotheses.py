@@ -1,23 +1,19 @@
-"""Selection of a model: the textbook as a base, effects beside it, and orders of terms beyond.
-
-Candidates are fitted to the errors of predictions, and judged on parts that their fits did not see.
-"""
+"""Hypotheses on a drive: the textbook as a base, effects beside it, and orders of terms beyond."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify import effects, shooting, terms
-from nics_drl_bridge.identify.calibration import Calibration, name_sum
-from nics_drl_bridge.identify.clocks import SEPARABLE_S
-from nics_drl_bridge.identify.effects import MOUNTING, Evidence, Rows
+from nics_drl_bridge.identify import forms, shooting, terms
+from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.fit import Alpha, Order, list_unmoved_variables, prune
 from nics_drl_bridge.identify.open_loop import HORIZON_S
 from nics_drl_bridge.identify.statistics import CERTAIN
@@ -43,25 +39,18 @@ NOTHING = 1e-4  # m, rad: size below which a removed part of a mounting counts a
 # A model uses the values at the start of a step, so a time is uncertain by the standard deviation
 # of a uniform distribution over the step.
 WITHIN_STEP = 12.0**-0.5
-NO_ERROR = 1e-9
+MOUNTING = ("x", "y", "heading")  # parameters of the tracked body's pose
 # ratio of the error of a pull to that of a stronger one, from which no weaker one is tried
 HOPELESS = 1.02
 LONGEST_LAG_S = 2.0  # a state that takes longer is coasting, so it hides no latency
 BANDS_S = (0.5, 1.0, 2.0, HORIZON_S)
 UNSEEN = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
 
-# effects of states in words, by the end of the name of a parameter
-EFFECTS = {
-    "drag and back-EMF": ".drag",
-    "dry friction": ".friction",
-    "limits": ".rise",
-}
-
 # (order, 0 for the textbook's terms alone; pull towards these)
 Hypothesis = tuple[int, float]
 TEXTBOOK = 0, 0.0
 # name of a change, the change, and the fraction to which it must cut the error
-Change = tuple[str, Callable[[Rows], Rows], float]
+Change = tuple[str, Callable[[forms.Form], forms.Form], float]
 
 
 @dataclass(frozen=True)
@@ -93,27 +82,11 @@ class Trial:
 
 @dataclass(frozen=True)
 class Draft:
-    """Evidence, and the prediction problem by which models of it are fitted.
+    """A form, and the prediction problem by which its models are fitted."""
 
-    The names of the problem's parameters tell which effects these models have.
-    """
-
-    evidence: Evidence
+    library: terms.Library
+    form: forms.Form
     problem: shooting.Shooting
-
-    @classmethod
-    def of(cls, evidence: Evidence, parameters: shooting.Parameters) -> "Draft":
-        """Returns a draft whose models have some parameters."""
-        return cls(evidence, effects.make_prediction_problem(evidence, parameters))
-
-    @property
-    def library(self) -> terms.Library:
-        """The terms that a model may have."""
-        return self.evidence.library
-
-    def start(self, parameters: shooting.Parameters) -> "Draft":
-        """Returns a draft whose searches start with other parameters of the same names."""
-        return replace(self, problem=replace(self.problem, parameters=parameters))
 
     def select(self, inside: terms.Mask | None) -> Samples:
         """Returns the samples inside (T,), with the states that follow the commands."""
@@ -124,10 +97,8 @@ class Draft:
         self, inside: terms.Mask | None = None, other: TaylorModel | None = None
     ) -> shooting.Predictive:
         """Fits the base's terms, gains and lags; the search may start at another model."""
-        model = self.library.fit_base(
-            self.select(inside), "tyres" in self.problem.parameters.names
-        )
-        if self.evidence.followed:
+        model = self.library.fit_base(self.select(inside), self.form.tyres)
+        if self.form.followed:
             model = terms.add_linear_terms(model)
         first = None
         if other is not None:
@@ -175,7 +146,7 @@ class Draft:
         )
         calibration = replace(
             calibration,
-            inputs=effects.make_curves(self.library.spec, at),
+            inputs=self.form.make_curves(at),
             responses=tuple(responses),
             uncertainty=calibration.uncertainty | self._widen_errors(found),
         )
@@ -185,15 +156,11 @@ class Draft:
         return calibration
 
     def _widen_errors(self, found: shooting.Predictive) -> dict[str, float]:
-        """Returns the errors of the parameters of commands and states; a step widens delays.
-
-        Parameters that do not affect the predictions are left out.
-        """
+        """Returns the errors of the parameters of commands and states; a step widens delays."""
         within_step = WITHIN_STEP * self.problem.samples.dt
         return {
             name: float(np.hypot(e, within_step)) if name.endswith(".delay") else e
-            for name, e in found.errors.items()
-            if "." in name and e > NO_ERROR
+            for name, e in found.shown_errors.items()
         }
 
     def _calibrate_time(
@@ -201,8 +168,8 @@ class Draft:
     ) -> Calibration:
         """Returns a calibration with the clock offset and the latency of a search."""
         at = found.named
-        latency = effects.find_latency(at)
-        delays = (name for name in at if name.endswith(".delay"))
+        latency = self.form.find_latency(at)
+        delays = (f"{command}.delay" for command, _ in self.form.delays)
         quickest = min(delays, key=at.__getitem__, default="latency")
         within_step = WITHIN_STEP * self.problem.samples.dt
         error = float(np.hypot(found.errors[quickest], within_step))
@@ -224,7 +191,7 @@ class Draft:
     ) -> TaylorModel:
         """Returns a found model with standard errors; those of other terms are a linear fit's."""
         errors = found.coefficient_errors.copy()
-        for state, command in self.evidence.followed:
+        for state, command in self.form.followed:
             _add_lag_errors(errors, found, state, command)
         named = {dof: dict(by_term) for dof, by_term in linear.named_errors.items()}
         model = found.model
@@ -245,39 +212,10 @@ class Draft:
         if (coefficients == model.coefficients).all():
             return found
         pruned = replace(model, coefficients=coefficients)
-        problem = self.start(found.parameters).problem
+        parameters = replace(self.problem.parameters, start=found.values)
+        problem = replace(self.problem, parameters=parameters)
         free = self.library.select_free(pruned)
         return shooting.fit_to_predictions(problem, pruned, free)
-
-    def start_calibrated(
-        self, found: shooting.Predictive, calibration: Calibration
-    ) -> "Draft":
-        """Returns a draft that starts from the values found, less what a calibration has of them.
-
-        That is the mounting, and a part of the latency.
-        """
-        parameters = found.parameters
-        is_mounting = np.isin(parameters.names, list(MOUNTING))
-        left = np.where(is_mounting, 0.0, parameters.start)
-        had_s = effects.find_latency(found.named) - calibration.command_latency_s
-        parameters = replace(parameters, start=left)
-        return self.start(parameters.shift_stamps(had_s))
-
-    def add_sums(
-        self, calibration: Calibration, found: shooting.Predictive
-    ) -> Calibration:
-        """Adds the errors of sums of latency and lag, told where noise hides the parts."""
-        errors = dict(calibration.uncertainty)
-        if not errors.get("command_latency_s", 0.0) > SEPARABLE_S:
-            return calibration
-        names = list(found.parameters.names)
-        for state, command in self.evidence.followed:
-            delay = f"{command}.delay"
-            pair = [names.index(delay if delay in names else "latency")]
-            pair.append(names.index(f"{state}.lag"))
-            variance = float(found.value_covariance[np.ix_(pair, pair)].sum())
-            errors[name_sum(state)] = float(np.sqrt(max(variance, 0.0)))
-        return replace(calibration, uncertainty=errors)
 
     def cross_validate(self, asked: tuple[Hypothesis, ...]) -> tuple[Trial, ...]:
         """Cross-validates hypotheses over `FOLDS` parts of a drive.
@@ -301,8 +239,9 @@ class Draft:
     @cached_property
     def _coarse(self) -> "Draft":
         """The same draft with fewer windows, and with known parameters, for trials."""
-        known = self.start(self.problem.parameters.freeze())
-        return replace(known, problem=replace(known.problem, spacing_s=SPACING_S))
+        parameters = self.problem.parameters.freeze()
+        problem = replace(self.problem, spacing_s=SPACING_S, parameters=parameters)
+        return replace(self, problem=problem)
 
     @cached_property
     def _folds(self) -> tuple["Fold", ...]:
@@ -330,7 +269,7 @@ class Draft:
         for fold in self._folds:
             with suppress(FitError):
                 inside = self._coarse.select(~fold.unseen)
-                starts = {k: self.library.fit(inside, k).model for k in orders}
+                starts = {k: self.library.fit_model(inside, k) for k in orders}
                 yield replace(fold, starts=starts)
 
     def try_hypothesis(self, order: int, pull: float, folds: list["Fold"]) -> Trial:
@@ -387,74 +326,53 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Base:
-    """The textbook's terms with the best-predicting effects, from which models depart."""
+    """The textbook's terms with the best-predicting form, from which models depart."""
 
     draft: Draft  # its parameters start from the values found
     found: shooting.Predictive
-    candidates: tuple[Candidate, ...] = ()  # effects that were tried, in this order
+    candidates: tuple[Candidate, ...] = ()  # forms that were tried, in this order
 
     @cached_property
     def trial(self) -> Trial:
-        """The cross-validation of the textbook with these effects."""
+        """The cross-validation of the textbook with this form."""
         return self.draft.cross_validate((TEXTBOOK,))[0]
 
-    def change(self, change: Callable[[Rows], Rows]) -> "Base":
-        """Fits the textbook with other effects; the search starts at this one."""
-        rows = change(self.draft.problem.parameters.rows)
-        return fit_rows(self.draft.evidence, rows, self)
 
-
-def fit_rows(evidence: Evidence, rows: Rows, start: Base | None = None) -> Base:
-    """Fits the textbook with the parameters of rows; the search may start at another base."""
-    parameters = effects.make_parameters(rows)
-    model = None
-    if start is not None:
-        parameters = parameters.start_from(start.draft.problem.parameters)
-        model = start.found.model
-    draft = Draft.of(evidence, parameters)
-    if start is not None:
-        known = start.found.parameters.names
-        problem = effects.choose_start(draft.problem, start.found.model, known)
-        draft = replace(draft, problem=problem)
-    coarse = replace(draft, problem=replace(draft.problem, spacing_s=SPACING_S))
-    found = coarse.fit_base(other=model)
-    return Base(draft.start(found.parameters), found)
-
-
-def fit_base(evidence: Evidence, clear: tuple[InputCurve, ...]) -> Base:
-    """Fits the textbook with and without each effect; keeps what improves predictions.
+def fit_base(evidence: forms.Evidence, clear: tuple[InputCurve, ...]) -> Base:
+    """Fits the textbook with and without each part of a form; keeps what improves predictions.
 
     `clear` curves are always kept.
     """
     best = _choose_curves(evidence, clear)
     candidates = list(best.candidates)
     # Each change builds on those that were kept before it, so their order matters.
-    tried = [best.found.parameters.names]  # since the last that was kept
+    tried = [best.draft.form]  # since the last that was kept
     for name, change, worth in list_changes(evidence):
-        names = tuple(change(best.found.parameters.rows))
-        if set(names) in map(set, tried):
+        form = change(best.draft.form)
+        if form in tried:
             continue
-        tried.append(names)
-        changed = best.change(change)
+        tried.append(form)
+        changed = fit_form(evidence, form, best)
         is_better = changed.trial.level < worth * best.trial.level
         is_better = is_better and _is_certain(changed.found, best.found)
         candidates.append(Candidate(name, changed.trial.error, kept=is_better))
         if is_better:
             best = changed
-            tried = [names]
+            tried = [form]
     return replace(best, candidates=tuple(candidates))
 
 
-def _choose_curves(evidence: Evidence, clear: tuple[InputCurve, ...]) -> Base:
-    """Fits the plainest model with all input curves found, or with the `clear` ones if better."""
+def _choose_curves(evidence: forms.Evidence, clear: tuple[InputCurve, ...]) -> Base:
+    """Fits the plainest form with all input curves found, or with the `clear` ones if better."""
+    plain_form = forms.make_form(evidence)
     inputs = evidence.calibration.inputs
-    curved = fit_rows(evidence, effects.list_plain_rows(evidence, inputs))
+    curved = fit_form(evidence, replace(plain_form, curves=inputs))
     if len(inputs) <= len(clear):
         start = "textbook with input curves" if inputs else "textbook"
         return replace(
             curved, candidates=(Candidate(start, curved.trial.error, kept=True),)
         )
-    plain = fit_rows(evidence, effects.list_plain_rows(evidence, clear))
+    plain = fit_form(evidence, replace(plain_form, curves=clear))
     # an infinite level: too short to judge
     is_better = plain.trial.level < curved.trial.level or np.isinf(plain.trial.level)
     candidates = (
@@ -464,70 +382,77 @@ def _choose_curves(evidence: Evidence, clear: tuple[InputCurve, ...]) -> Base:
     return replace(plain if is_better else curved, candidates=candidates)
 
 
-def refit_base(evidence: Evidence, former: Base) -> Base:
-    """Fits a base with the same effects to other data."""
-    rows = effects.list_plain_rows(evidence) | former.draft.problem.parameters.rows
-    refitted = fit_rows(evidence, rows, former)
+def refit_base(evidence: forms.Evidence, former: Base) -> Base:
+    """Fits a base of the same form to other data."""
+    followed = forms.make_form(evidence).followed
+    inputs = evidence.calibration.inputs
+    form = replace(former.draft.form, curves=inputs, followed=followed)
+    refitted = fit_form(evidence, form, former if followed else None)
     return replace(refitted, candidates=former.candidates)
 
 
-def list_changes(evidence: Evidence) -> Iterator[Change]:
-    """Yields changes to the effects of a model in the order in which they are tried."""
-    spec = evidence.drive.spec
-    is_motion = evidence.library.kind is terms.Kind.MOTION
-    speeds = [v.name for v in spec.state if v.twist == "vx" and is_motion]
-    apart = "a delay of each command", _set(effects.list_delay_rows(evidence)), WORTH
-    # First, because a wrong delay hides other effects and is hidden by them.
-    yield apart
-    if is_motion and terms.has_slipping_tyres(spec):
-        yield "tyres that slip", _set(effects.TYRES), WORTH
-    # Drag and friction are hard to distinguish, so both are tried, then each without the other.
-    for speed in speeds:
-        drag = effects.list_drag_rows(evidence, speed)
-        friction = effects.list_friction_rows(evidence, speed)
-        yield "drag and back-EMF, and dry friction", _set(drag | friction), WORTH
-        yield "without drag and back-EMF", _drop(drag), 1.0 / WORTH
-        yield "without dry friction", _drop(friction), 1.0 / WORTH
-    for state, _ in evidence.followed:
-        yield f"limits of {state}", _limit(evidence, [state]), WORTH
-    yield apart
-    for _, command in evidence.followed:
-        dead = effects.list_dead_zone_rows(evidence, command)
-        yield f"a dead zone of {command}", _fill(dead), WORTH
-    if not speeds:
+def fit_form(
+    evidence: forms.Evidence, form: forms.Form, start: Base | None = None
+) -> Base:
+    """Fits the textbook with a form; the search may start at another base."""
+    parameters = forms.list_parameters(evidence, form)
+    if start is not None:
+        parameters = parameters.start_from(start.draft.problem.parameters)
+    problem = forms.make_prediction_problem(evidence, form, parameters)
+    model = None
+    if start is not None:
+        model = start.found.model
+        problem = forms.choose_start(problem, model, start.found.names)
+    coarse = replace(problem, spacing_s=SPACING_S)
+    found = Draft(evidence.library, form, coarse).fit_base(other=model)
+    parameters = replace(problem.parameters, start=found.values)
+    problem = replace(problem, parameters=parameters)
+    return Base(Draft(evidence.library, form, problem), found)
+
+
+def list_changes(evidence: forms.Evidence) -> Iterator[Change]:
+    """Yields changes to the form of a model in the order in which they are tried."""
+    if evidence.library.kind is not terms.Kind.MOTION:
+        yield from _list_follower_changes(evidence)
         return
-    bent: Rows = {}
-    for command in effects.list_driving_commands(spec):
-        bent |= effects.list_dead_zone_rows(evidence, command)
-    yield "a dead zone", _fill(bent), WORTH
-    yield "limits of acceleration", _limit(evidence, speeds), WORTH
-    others = [v.name for v in spec.state if v.twist and not spec.steers]
-    yield f"limits of {', '.join(others)}", _limit(evidence, others), WORTH
-    backwards = effects.list_reverse_rows(evidence)
-    yield "a gain of its own backwards", _fill(backwards), WORTH
+    spec = evidence.drive.spec
+    # Drag and friction are hard to distinguish, so both are tried, then each without the other.
+    speeds = tuple(v.name for v in spec.state if v.twist == "vx")
+    delays = _list_delay_changes(forms.list_delays(evidence))
+    # First, because a wrong delay hides other effects and is hidden by them.
+    yield from delays
+    if terms.has_slipping_tyres(spec):
+        yield "tyres that slip", _change(tyres=True), WORTH
+    if speeds:
+        drag = "drag and back-EMF"
+        friction = "dry friction"
+        yield f"{drag}, and {friction}", _change(drag=speeds, friction=speeds), WORTH
+        yield f"without {drag}", _change(drag=()), 1.0 / WORTH
+        yield f"without {friction}", _change(friction=()), 1.0 / WORTH
+    yield from delays
+    if speeds:
+        bent = partial(forms.add_dead_zones, evidence=evidence)
+        yield "a dead zone", bent, WORTH
+        yield "limits of acceleration", _change(limits=speeds), WORTH
+        others = tuple(v.name for v in spec.state if v.twist and not spec.steers)
+        if others:
+            yield f"limits of {', '.join(others)}", _change(limits=others), WORTH
+        backwards = forms.find_two_way_curves(evidence)
+        if backwards:
+            reverse = partial(forms.add_reverse_gains, curves=backwards)
+            yield "a gain of its own backwards", reverse, WORTH
 
 
-def _set(more: Rows) -> Callable[[Rows], Rows]:
-    """Returns a change that adds parameters, or gives them other bounds."""
-    return lambda rows: rows | more
+def _change(**parts: Any) -> Callable[[forms.Form], forms.Form]:
+    """Returns a change that sets parts of a form."""
+    return lambda form: replace(form, **parts)
 
 
-def _fill(more: Rows) -> Callable[[Rows], Rows]:
-    """Returns a change that adds the parameters that a model lacks."""
-    return lambda rows: more | rows
-
-
-def _drop(less: Rows) -> Callable[[Rows], Rows]:
-    """Returns a change that drops parameters."""
-    return lambda rows: {name: rows[name] for name in rows if name not in less}
-
-
-def _limit(evidence: Evidence, states: list[str]) -> Callable[[Rows], Rows]:
-    """Returns a change that limits the fall and rise of states."""
-    rows: Rows = {}
-    for state in states:
-        rows |= effects.list_limit_rows(evidence, state)
-    return _set(rows)
+def _list_delay_changes(delays: tuple[tuple[str, float], ...]) -> list[Change]:
+    """Returns the change that delays each command by itself, if there are several."""
+    if len(delays) < 2:
+        return []
+    return [("a delay of each command", _change(delays=delays), WORTH)]
 
 
 def _is_certain(changed: shooting.Predictive, before: shooting.Predictive) -> bool:
@@ -536,15 +461,28 @@ def _is_certain(changed: shooting.Predictive, before: shooting.Predictive) -> bo
     return not any(
         value < CERTAIN * errors[name]
         for name, value in changed.named.items()
-        if name.endswith((".dead", ".fall", ".rise"))
-        and name not in before.parameters.names
+        if name.endswith((".dead", ".fall", ".rise")) and name not in before.names
     )
+
+
+def _list_follower_changes(evidence: forms.Evidence) -> Iterator[Change]:
+    """Yields changes to the form of states that follow commands."""
+    followed = forms.list_followed(evidence.drive)
+    latency = evidence.calibration.command_latency_s
+    delays = _list_delay_changes(tuple((c, latency) for _, c in followed))
+    yield from delays
+    for state, _ in followed:
+        yield f"limits of {state}", partial(forms.add_limits, state=state), WORTH
+    yield from delays
+    for _, command in followed:
+        bent = partial(forms.add_dead_zones, evidence=evidence, commands=(command,))
+        yield f"a dead zone of {command}", bent, WORTH
 
 
 def list_candidates(
     base: Base | None, trials: Sequence[Trial], order: Order = "auto"
 ) -> Iterator[Candidate]:
-    """Yields all candidates that were tried: effects beside the textbook, then orders of terms."""
+    """Yields all candidates that were tried: forms of the textbook, then orders of terms."""
     if base is not None:
         yield from base.candidates
     if not trials:
@@ -650,7 +588,8 @@ def add_predicted_mounting(
     known = dict(calibration.uncertainty)
     if np.isnan(sigma[1]) and rest[1] == 0.0:
         pose[1] = calibration.lever_arm_m[1]
-    for name, error in zip(MOUNTING.values(), sigma.tolist(), strict=True):
+    names = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad")
+    for name, error in zip(names, sigma.tolist(), strict=True):
         if not np.isnan(error):  # what the model lacks bends each of both estimates
             known[name] = max(error, known.get(name, 0.0))
     x, y, heading = np.where(np.abs(pose) < NOTHING, 0.0, pose).tolist()
@@ -662,26 +601,26 @@ def add_predicted_mounting(
     )
 
 
-def describe_effects(
-    base: Base, trials: Sequence[Trial], order: Order
-) -> Iterator[str]:
+def describe_forms(base: Base, trials: Sequence[Trial], order: Order) -> Iterator[str]:
     """Lists what a model has besides the terms of its base, and how much that improves it."""
     best = choose_trial(trials, order)
     if not np.isfinite(best.error):
         return
-    names = base.found.parameters.names
-
-    def list_owners(suffix: str) -> list[str]:
-        return [n.removesuffix(suffix) for n in names if n.endswith(suffix)]
-
-    parts = [f"an input curve of {command}" for command in list_owners(".least")]
-    if list_owners(".delay"):
+    form = base.draft.form
+    parts = [
+        f"an input curve of {curve.command}" for curve in form.curves if curve.bends
+    ]
+    if form.delays:
         parts.append("a delay of each command")
-    for effect, suffix in EFFECTS.items():
-        owners = list_owners(suffix)
-        if owners:
-            parts.append(f"{effect} of {', '.join(owners)}")
-    if "tyres" in names:
+    effects = {
+        "drag and back-EMF": form.drag,
+        "dry friction": form.friction,
+        "limits": form.limits,
+    }
+    for effect, names in effects.items():
+        if names:
+            parts.append(f"{effect} of {', '.join(names)}")
+    if form.tyres:
         parts.append("tyres that slip")
     finding = "The model is the textbook"
     if base.draft.library.kind is terms.Kind.MEASURED:
