@@ -168,7 +168,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
             "bodies": self._bodies,
         }
         data = {
-            # Tensors have no structured types, so checkpoints store the plain numbers.
+            # Checkpoints store the plain numbers of structured arrays.
             f"data.{name}": rows.view(np.int64) if rows.dtype.names else rows
             for name, rows in self.simulator.data._asdict().items()
         }

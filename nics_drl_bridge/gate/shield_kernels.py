@@ -15,8 +15,8 @@ full speed. `is_free` checks such a stop in four steps:
 
 Shared arguments:
     twist (3,): of the robot before it stops: vx, vy [m/s], turn rate [rad/s].
-    braked_speed: the one that is braked [m/s], as `_bound_path` returns it; `speed` is that of the
-        origin.
+    braked_speed: the speed that limits braking [m/s], as `_bound_path` returns it; `speed` is that
+        of the origin.
 """
 
 import math
@@ -89,7 +89,7 @@ class Stop(NamedTuple):
 
 @kernel(allocates=True)
 def is_free(obstacles: Array, twists: Array, stop: Stop, step: float) -> bool:
-    """True if a robot keeps its margin from all obstacles while it stops from any of the twists.
+    """True if a robot keeps its margin from all obstacles whichever of the twists it stops from.
 
     An obstacle that is already within the margin must not come nearer.
 
@@ -299,7 +299,7 @@ def _fill_places_of_separate_turn(
 def _split_time(
     time: float, twist: Array, braked_speed: float, stop: Stop
 ) -> tuple[float, float]:
-    """Returns the times at full speed and full turn rate that move a braking robot as far [s]."""
+    """Returns the times [s] at full speed and full turn rate that cover what braking covers."""
     drive_time = _compute_full_speed_time(
         time, braked_speed, stop.reaction, stop.deceleration
     )
@@ -346,7 +346,7 @@ def _append_place(places: Array, s: int, arc: tuple[float, float, float]) -> Non
 
 @kernel
 def _compute_braking_time(full_speed_time: float, speed: float, stop: Stop) -> float:
-    """Returns the time in which a braking robot gets as far as in a time at full speed [s]."""
+    """Returns the time [s] in which braking covers what full speed covers in `full_speed_time`."""
     braking_time = full_speed_time - stop.reaction
     if braking_time <= 0.0:
         return full_speed_time

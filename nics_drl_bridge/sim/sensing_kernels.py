@@ -186,7 +186,7 @@ def scan_or_wait(n: int, waiting_count: int, part: Part) -> int:
         for m in range(data.pose.shape[1]):
             _scan_from_past(n, m, part)
         return waiting_count
-    part.scratch.scans.waiting[waiting_count] = n
+    part.scans.waiting[waiting_count] = n
     return waiting_count + 1
 
 
@@ -195,8 +195,8 @@ def scan_together(waiting_count: int, part: Part) -> None:
     """Scan the waiting worlds at their current state."""
     data = part.data
     lidar = part.lidar
-    scans = part.scratch.scans
-    cells = part.scratch.cells
+    scans = part.scans
+    cells = part.cells
     for n in scans.waiting[:waiting_count]:
         for m in range(data.pose.shape[1]):
             pose = locate_lidar(data.pose[n, m], lidar.mount)
@@ -236,7 +236,7 @@ def _scan_from_past(n: int, m: int, part: Part) -> None:
     """
     data = part.data
     lidar = part.lidar
-    scans = part.scratch.scans
+    scans = part.scans
     steps = data.steps[n]
     substeps = part.motion.substeps
     skew = data.faults[n, m, fault_kernels.SKEW]
@@ -292,15 +292,15 @@ def _gather_bodies(n: int, m: int, lag: int, reach: float, part: Part) -> int:
     data = part.data
     world_set = part.world_set
     motion = part.motion
-    scans = part.scratch.scans
-    found = part.scratch.cells.found
+    scans = part.scans
+    found = part.cells.found
     pose = scans.pose
     first_robot = data.velocity.shape[1]
     candidates = data.bodies.shape[1]
     # The cells of a crowd are sorted by current positions.
     in_cells = world_set.standing or (world_set.crowded and lag == 0)
     if in_cells:
-        candidates = find_around(n, pose[0], pose[1], reach, part.scratch.cells)
+        candidates = find_around(n, pose[0], pose[1], reach, part.cells)
     count = 0
     ago = min(lag * motion.dt, FURTHEST_BACK)
     for i in range(candidates):

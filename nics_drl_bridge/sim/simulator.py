@@ -495,7 +495,7 @@ class FastSimulator:
             )
             packed[part.start] = pack(
                 records.Part(
-                    self.data, world_set, self._scanner.arguments, motion, scratch
+                    self.data, world_set, self._scanner.arguments, motion, *scratch
                 )
             )
             step_kernels.sort_worlds(packed[part.start], part.start, part.stop)
@@ -718,7 +718,13 @@ def _stack_plans(
 
 def _allocate_scratch(
     model: SimulatorModel, sizes: Sizes, cells: records.BodyCells, worlds: int
-) -> records.Scratch:
+) -> tuple[
+    records.Lanes,
+    records.Single,
+    records.ContactScratch,
+    records.BodyCells,
+    records.Scans,
+]:
     """Allocate the memory of a thread that steps a number of worlds."""
     kinematics = model.kinematics
     robots = sizes.robots
@@ -727,16 +733,16 @@ def _allocate_scratch(
     blocks = -(-worlds * robots // LANES)
     lanes = robots * min(worlds, -(-worlds // blocks))
     commands = len(kinematics.variables) - kinematics.state_size
-    return records.Scratch(
-        lanes=records.Lanes(
+    return (
+        records.Lanes(
             pose=np.zeros((records.LANE_ROWS, lanes)),
             x=np.ones((len(kinematics.variables) + 1, lanes)),
             dq=np.zeros((len(kinematics.dofs), lanes)),
             change=np.zeros((commands, lanes), np.int64),
             coefficient=np.zeros((np.count_nonzero(kinematics.coefficients), lanes)),
         ),
-        single=records.Single(*allocate_scratch(kinematics)),
-        contact=records.ContactScratch(
+        records.Single(*allocate_scratch(kinematics)),
+        records.ContactScratch(
             motions=np.zeros(robots, records.MOTION),
             listed=records.allocate_touches(),
             start=np.zeros((obstacles, 3)),
@@ -747,11 +753,11 @@ def _allocate_scratch(
             reach=np.zeros(bodies),
             speeds=np.zeros((robots, 2)),
         ),
-        cells=cells._replace(
+        cells._replace(
             then=cells.then.copy() if cells.ordered else cells.then,
             found=cells.found.copy(),
         ),
-        scans=records.Scans(
+        records.Scans(
             start_poses=np.zeros((lanes, 3)),
             waiting=np.zeros(worlds, np.int64),
             bodies=np.zeros((bodies + 1, BODY)),

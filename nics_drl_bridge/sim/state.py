@@ -2,8 +2,8 @@
 
 A simulation runs N worlds. Each is a copy of one of the P members of a world set and
 contains M robots and K obstacles. `State` changes in each period, `WorldSetArrays` and
-`Dynamics` never change, and `Scratch` holds no information between calls. One thread
-steps one `Part` of the worlds.
+`Dynamics` never change, and scratch memory holds no information between calls. One
+thread steps one `Part` of the worlds.
 
 Other dimensions: S state, C commands, T kinematic terms, H periods of command history,
 R periods of the past, W walls, B beams, L lanes, G groups of beams, n a subset of the
@@ -313,16 +313,6 @@ class Scans(NamedTuple):
     scratch: ScanScratch
 
 
-class Scratch(NamedTuple):
-    """Scratch memory of one thread."""
-
-    lanes: Lanes
-    single: Single
-    contact: ContactScratch
-    cells: BodyCells  # cells of all worlds, with the thread's own list `found`
-    scans: Scans
-
-
 class Part(NamedTuple):
     """Everything that kernels need to step the worlds of one part."""
 
@@ -330,4 +320,9 @@ class Part(NamedTuple):
     world_set: WorldSetArrays
     lidar: LidarArrays
     motion: Dynamics
-    scratch: Scratch
+    # scratch memory of the thread
+    lanes: Lanes
+    single: Single
+    contact: ContactScratch
+    cells: BodyCells  # cells of all worlds, with the thread's own list `found`
+    scans: Scans

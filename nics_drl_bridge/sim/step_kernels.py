@@ -11,7 +11,7 @@
 4. `_measure_world` measures the odometry.
 5. Each robot scans, and its lidar's faults are applied, see `sensing_kernels`.
 
-`begin_episodes` resets worlds whose robots and obstacles are in place. `begin_period` and
+`begin_episodes` takes the first scans, once robots and obstacles are in place. `begin_period` and
 `end_period` are steps 1, 4 and 5 for worlds whose robots another engine moves.
 
 A world is bit-identical in any batch, part or thread: nothing is summed over worlds,
@@ -69,22 +69,22 @@ from nics_drl_bridge.sim.state import (
 
 # Minimum number of robots that are scanned before their scans are distorted; this few
 # scans fit into the L2 cache.
-SCANNED_TOGETHER = 48
+ROBOTS_PER_BATCH = 48
 
 
 @kernel(allocates=True)
 def step_worlds(packed: Any, commands: Array, first_world: int) -> None:
-    """Step n worlds of a part, starting at `first_world`, under commands (n, M, C)."""
+    """Step the worlds of a part from `first_world` on, one for each row of commands (n, M, C)."""
     _step_part(packed.content, commands, first_world)
 
 
 @kernel(allocates=True)
 def begin_episodes(packed: Any, chosen: Integers) -> None:
-    """Begin episodes in worlds `chosen` (n,); everything is in place and at rest."""
+    """Take the first scans in worlds `chosen` (n,), where everything is in place and at rest."""
     part = packed.content
     for i in range(len(chosen)):
         n = chosen[i]
-        part.scratch.scans.waiting[i] = n
+        part.scans.waiting[i] = n
         scene = get_surroundings(n, part.world_set)
         if part.world_set.moves:
             obstacles.reset_marks(n, part.data, scene.plans)
@@ -164,12 +164,12 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
     end_world = first_world + len(commands)
     _queue_commands(data.history, commands, first_world, part.motion.terms.curves)
     # A block fills the lanes. In a shorter last block, the other lanes are moved to no effect.
-    worlds_per_block = part.scratch.lanes.pose.shape[1] // robots
+    worlds_per_block = part.lanes.pose.shape[1] // robots
     for block_begin in range(first_world, end_world, worlds_per_block):
         block_end = min(block_begin + worlds_per_block, end_world)
         for n in range(block_begin, block_end):
             _begin_period_of_world(n, (n - block_begin) * robots, part)
-        move_freely(block_begin, block_end, data, part.motion, part.scratch.lanes)
+        move_freely(block_begin, block_end, data, part.motion, part.lanes)
         waiting_count = np.int64(0)
         first_to_distort = block_begin
         for n in range(block_begin, block_end):
@@ -180,7 +180,7 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
             _measure_world(n, first_lane, scene, part)
             waiting_count = sensing.scan_or_wait(n, waiting_count, part)
             is_last = n + 1 == block_end
-            if is_last or (n + 1 - first_to_distort) * robots >= SCANNED_TOGETHER:
+            if is_last or (n + 1 - first_to_distort) * robots >= ROBOTS_PER_BATCH:
                 sensing.scan_together(waiting_count, part)
                 sensing.distort_scans(first_to_distort, n + 1, part)
                 waiting_count = np.int64(0)
@@ -209,12 +209,12 @@ def _begin_period_of_world(n: int, first_lane: int, part: Part) -> None:
     If an episode begins, also record its start, with the robots at rest.
     """
     data = part.data
-    speeds = part.scratch.contact.speeds
+    speeds = part.contact.speeds
     newest = data.steps[n] % data.past.shape[2]
     for m in range(data.pose.shape[1]):
         pose = data.pose[n, m]
         for i in range(3):
-            part.scratch.scans.start_poses[first_lane + m, i] = pose[i]
+            part.scans.start_poses[first_lane + m, i] = pose[i]
         row = data.past[n, m, newest]
         if data.steps[n] == 0:
             for i in range(3):
@@ -238,16 +238,17 @@ def _begin_period_of_world(n: int, first_lane: int, part: Part) -> None:
 def _measure_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> None:
     """Put the robots' bodies at their present poses, and measure their odometry.
 
-    In a crowd, the cells also take note of how far a body moved.
+    In a crowd, the cells also record how far a body moved.
     """
     data = part.data
     motion = part.motion
-    single = part.scratch.single
-    frame = part.scratch.cells.frame
+    single = part.single
+    frame = part.cells.frame
     for m in range(data.pose.shape[1]):
         pose = data.pose[n, m]
-        start = part.scratch.scans.start_poses[first_lane + m]
+        start = part.scans.start_poses[first_lane + m]
         contacts.put_body(data.bodies[n, data.velocity.shape[1] + m], pose)
+        # the twist at the end of the period
         compute_rates(n, m, motion.substeps - 1, data, motion, single)
         sensing.measure_odometry(n, m, start, pose, single.dq, data, motion)
         sensing.record_truth(n, m, pose, single.dq, data)
@@ -263,11 +264,11 @@ def _measure_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> 
 def _sort_bodies(n: int, scene: Surroundings, part: Part) -> None:
     """Sort the bodies of world n into cells, or its static obstacles by cell."""
     bodies = part.data.bodies[n]
-    cells = part.scratch.cells
+    cells = part.cells
     if scene.crowded:
         sort_into_cells(n, bodies, len(bodies), cells)
     elif scene.standing:
-        spare = part.scratch.scans.bodies
+        spare = part.scans.bodies
         put_in_order(n, bodies, part.data.velocity.shape[1], spare, cells)
 
 
@@ -295,8 +296,8 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
     """Move robots and obstacles of world n, after `move_freely`; let the robots drift."""
     data = part.data
     motion = part.motion
-    lanes = part.scratch.lanes
-    start = part.scratch.contact.start
+    lanes = part.lanes
+    start = part.contact.start
     obstacles_move = _find_what_is_near(n, first_lane, scene, part)
     if obstacles_move:
         for k in range(len(start)):
@@ -304,7 +305,7 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
                 start[k, i] = data.bodies[n, k, i]
     any_may_touch = False
     for m in range(data.pose.shape[1]):
-        if part.scratch.contact.may_touch[m] != FREE:
+        if part.contact.may_touch[m] != FREE:
             any_may_touch = True
             continue
         lane = first_lane + m
@@ -335,10 +336,10 @@ def _find_what_is_near(
 ) -> bool:
     """Find what each robot may touch; return True if an obstacle moves."""
     data = part.data
-    lane_poses = part.scratch.lanes.pose
-    contact = part.scratch.contact
+    lane_poses = part.lanes.pose
+    contact = part.contact
     reach = contact.reach
-    cells = part.scratch.cells
+    cells = part.cells
     first = data.velocity.shape[1]
     period = part.motion.dt * part.motion.substeps
     longest = 0.0  # path of any body
@@ -359,7 +360,7 @@ def _find_what_is_near(
         path = lane_poses[LANE_PATH, first_lane + m]
         body = data.bodies[n, first + m]
         if not is_round(body, scene.outlines):
-            # If a corner touches something, turning moves the robot away.
+            # Turning sweeps the corners, which adds to the path.
             turned = lane_poses[LANE_HEADING, first_lane + m] - data.pose[n, m, 2]
             path += abs(turned) * body[RADIUS]
         path += math.sqrt(3.0 * period) * sum_of_deviations
@@ -386,8 +387,8 @@ def _move_carefully(
     """
     data = part.data
     motion = part.motion
-    single = part.scratch.single
-    contact = part.scratch.contact
+    single = part.single
+    contact = part.contact
     may_touch = contact.may_touch
     stops = contact.stops
     period = motion.dt * motion.substeps
@@ -425,7 +426,7 @@ def _move_carefully(
             ahead, left, turn = draw_drift(n, m, data, motion)
             contacts.start_motion(m, ahead, left, turn, world)
             drifts = drifts or ahead != 0.0 or left != 0.0 or turn != 0.0
-    if drifts:  # a displacement is a twist over one second; the obstacles stay
+    if drifts:  # the drift is applied as a twist over one second; the obstacles stay
         contacts.advance(motion.substeps * motion.dt, 1.0, False, world)
     for m in range(len(may_touch)):
         if may_touch[m] != FREE:

@@ -219,6 +219,15 @@ def test_a_batch_of_fewer_rows_than_the_one_before_has_gradients_of_its_own():
     assert np.array_equal(gradients, wanted)
 
 
+def test_a_batch_of_one_transition_learns_from_its_own_advantage():
+    lean, theirs = pair()
+    one = Transitions(*(each[:1] for each in filled(lean, theirs)))
+    assert np.isfinite(lean.learner.differentiate(one))
+    gradients, _ = gradients_of(lean)
+    assert all(np.isfinite(gradient).all() for gradient in gradients)
+    assert any(gradient.any() for gradient in gradients)
+
+
 def test_a_rollout_is_that_of_stable_baselines3_over_ends_of_episodes_and_time_limits():
     lean, theirs = pair(
         log_std=-30.0

@@ -1,7 +1,7 @@
 """Compiled inner loops of the lean engine: gradients of PPO's loss.
 
-The loss is that of Stable-Baselines3. The kernels release the interpreter lock; autograd's many
-small steps would compete for it with the collecting thread. Shapes: n transitions, O observations,
+The loss is that of Stable-Baselines3. The kernels release the interpreter lock, so that they do not
+keep the collecting thread from running. Shapes: n transitions, O observations,
 C outputs of the actor, W weights of a network.
 """
 
@@ -127,12 +127,13 @@ def compute_actor_gradients(
     n = len(outputs)
     actions = batch.actions
     out = net.spare[0, : outputs.size].reshape(outputs.shape)
-    mean = advantages.mean()
     share = ONE / np.float32(n)
-    scale = ONE / (
-        np.sqrt(np.square(advantages - mean).sum() / np.float32(n - 1))
-        + np.float32(1e-8)
-    )
+    mean = ZERO
+    scale = ONE
+    if n > 1:  # a single advantage has no deviation
+        mean = advantages.mean()
+        variance = np.square(advantages - mean).sum() / np.float32(n - 1)
+        scale = ONE / (np.sqrt(variance) + np.float32(1e-8))
     log_std_gradient[:] = -entropy_weight
     loss = ZERO
     parts = np.empty(outputs.shape[1], np.float32)
