@@ -108,7 +108,10 @@ def measure(given: Given) -> Result:
         around = inherit_for_newcomer(folder)
         wait_for(["git", "clone", "--quiet", str(ROOT), str(clone)], folder, around)
         setup_s, told = wait_for(["sh", "-c", "make setup 2>&1"], clone, around)
-        ((kernels, compile_s),) = COMPILED.findall(told)
+        compiled = COMPILED.search(told)
+        if compiled is None:
+            raise RuntimeError(f"make setup compiled nothing:\n{told[-2000:]}")
+        kernels, compile_s = compiled.groups()
         result: Result = {
             "seconds": {},
             "setup_s": setup_s,

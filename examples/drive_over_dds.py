@@ -7,7 +7,7 @@ import numpy as np
 
 import nics_drl_bridge  # noqa: F401 - registers the environments
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 from nics_drl_bridge.policy.evaluation import drive
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.report.pictures import draw_trajectories
@@ -20,7 +20,7 @@ SEED = 1_000_000
 
 def main() -> None:
     model = open_model("differential")
-    domain_id = free_domain_id()
+    domain_id = choose_domain_id()
     policy, task = open_policy("differential", model)
     here = gymnasium.make(ENV, model=model, world=WORLD, task=task, estimator=True)
     inside = drive(here, policy, SEED)

@@ -28,7 +28,7 @@ from measuring.evaluations import standing_action
 from measuring.peers import WORLD
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
-from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 
 ROBOT = "ackermann"
 BEAMS = 720
@@ -223,7 +223,7 @@ def time_each(exchange: Exchange, count: int) -> list[float]:
 
 def measure_in_turns(chunks: int, size: int, control: str | None) -> dict[str, float]:
     """Returns steps and echoes per second over all chunks, and how long a step takes."""
-    domain_id = free_domain_id()
+    domain_id = choose_domain_id()
     with (
         tempfile.TemporaryDirectory() as folder,
         open_env(domain_id, Path(folder), control) as driving,

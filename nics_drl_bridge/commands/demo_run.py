@@ -293,26 +293,31 @@ class Demo:
         self, nodes: dict[str, dict[str, Any]], goal: list[float], near: float
     ) -> tuple[bool, Any]:
         from nics_drl_bridge.nodes.operator import Witness
-        from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+        from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 
-        domain_id = free_domain_id()
+        domain_id = choose_domain_id()
         logs = self._plan.out / "logs" / "realtime"
         model = {"model": str(self._plan.model)}
         with ExitStack() as stack:
             witness = stack.enter_context(Witness(domain_id))
-            processes = []
-            for node, parameters in nodes.items():
-                process = NodeProcess(node, logs, model | parameters, domain_id)
-                processes.append(stack.enter_context(process))
-                if node == "simulator_node" and not witness.sees(START_S):
+            processes = [
+                stack.enter_context(
+                    NodeProcess(node, logs, model | parameters, domain_id)
+                )
+                for node, parameters in nodes.items()
+            ]
+            simulator = processes[0]
+            if not witness.sees(START_S):
+                simulator.check()
+                raise BackendError(
+                    f"{simulator.node} publishes nothing after {START_S:g} s; look at its log, "
+                    f"{simulator.log}."
+                )
+            try:
+                armed = witness.arm("", START_S, False, lambda _: None)
+            finally:  # a node that ended says more than a gate that is missing
+                for process in processes:
                     process.check()
-                    raise BackendError(
-                        f"{node} publishes nothing after {START_S:g} s; look at its log, "
-                        f"{process.log}."
-                    )
-            armed = witness.arm("", START_S, False, lambda _: None)
-            for process in processes:
-                process.check()
             if not armed.granted:
                 raise BackendError(f"command_gate can't be armed: {armed.told}")
             self._say(

@@ -135,10 +135,10 @@ def drive_in(
         with closing(env):
             return drive_all(env, opened, seeds, on_episode)
     from nics_drl_bridge.nodes.operator import Witness
-    from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+    from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 
     node = NODES[place]
-    domain_id = free_domain_id()
+    domain_id = choose_domain_id()
     parameters = {
         "model": name,
         "world": world,

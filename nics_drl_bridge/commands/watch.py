@@ -47,7 +47,7 @@ def watch(
 
     Args:
         model: A model's folder, or a shipped robot; else the policy's own.
-        world: A shipped world or a YAML file; several times: side by side.
+        world: A shipped world (circles) or a YAML file; several times: side by side.
         seed: Seed of the first episode.
         lidar: A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.
         ros: Show live topics instead.

@@ -10,6 +10,7 @@ import numpy as np
 from geometry_msgs.msg import Twist
 from rclpy.node import Node
 
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.listener import SpunNode
 from nics_drl_bridge.recording.messages import read_command
@@ -20,9 +21,12 @@ def listen_to_commands(node: Node, out: Connection) -> None:
 
     def tell(message: Twist, info: Mapping[str, Any]) -> None:
         twist = np.array(read_command(message))
-        out.send((time.monotonic(), twist, info["source_timestamp"]))
+        arrival_s = time.monotonic()
+        if "received_timestamp" in info:  # the message then waited for this call
+            arrival_s -= (time.time_ns() - info["received_timestamp"]) / NS_PER_S
+        out.send((arrival_s, twist, info["source_timestamp"]))
 
-    node.create_subscription(Twist, "cmd_vel", tell, qos.COMMAND)
+    node.create_subscription(Twist, "cmd_vel", tell, qos.EVERY_COMMAND)
 
 
 def hear(domain_id: int | None, out: Connection) -> None:

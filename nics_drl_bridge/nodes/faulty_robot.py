@@ -38,7 +38,7 @@ class Robot(SpunNode):
     killed one may be blocked by the middleware for a second, and would notice the stop late.
     """
 
-    quality = qos.COMMAND  # of its topics
+    quality = qos.COMMAND  # of what its sensors publish
 
     def __init__(
         self,
@@ -69,10 +69,14 @@ class Robot(SpunNode):
             "cmd_vel_raw": TwistStamped,
             "odometry/filtered": Odometry,
         }
+        qualities = {"odom": self.quality, "scan": self.quality}
         for sensor in model.sensors:
             kinds[sensor.name] = conversions.find_sensor_type(sensor)
+            qualities[sensor.name] = self.quality
         self._topics = {
-            name: self.node.create_publisher(kind, name, self.quality)
+            name: self.node.create_publisher(
+                kind, name, qualities.get(name, qos.COMMAND)
+            )
             for name, kind in kinds.items()
         }
         self._lidar = model.lidar
@@ -90,7 +94,7 @@ class Robot(SpunNode):
         else:
             listen_to_commands(self.node, out)
         self.node.create_subscription(
-            TwistStamped, "cmd_vel_raw", self._hear_policy, qos.COMMAND
+            TwistStamped, "cmd_vel_raw", self._hear_policy, qos.EVERY_COMMAND
         )
         scan_hz = model.lidar.rate
         if odom_hz == 0.0:
@@ -211,9 +215,9 @@ class Robot(SpunNode):
 
         return super().until(is_done, seconds)
 
-    def call(self, service: str) -> Trigger.Response:
-        """Call a service of the gate."""
-        return self.call_service(Trigger, f"command_gate/{service}", PATIENCE_S)
+    def call(self, service: str, patience_s: float = PATIENCE_S) -> Trigger.Response:
+        """Call a service of the gate. Raises TimeoutError without an answer in time."""
+        return self.call_service(Trigger, f"command_gate/{service}", patience_s)
 
     def listeners(self) -> int:
         """Return the number of subscribers of its scans."""
@@ -247,16 +251,19 @@ class Robot(SpunNode):
 
     def arm(self, patience_s: float) -> None:
         """Reset the gate, and ask it to arm until it does. Raises NoMotionError."""
-        self.call("reset")
         deadline_s = time.monotonic() + patience_s
-        answer = self.call("arm")
-        while not answer.success:
-            if time.monotonic() > deadline_s:
-                raise NoMotionError(
-                    f"the gate did not arm within {patience_s:g} s: {answer.message}"
-                )
-            self.until(lambda: False, PERIOD_S)
-            answer = self.call("arm")
+        told = "it does not answer"
+        try:
+            self.call("reset", patience_s)
+            while time.monotonic() < deadline_s:
+                answer = self.call("arm", deadline_s - time.monotonic())
+                if answer.success:
+                    return
+                told = answer.message
+                self.until(lambda: False, PERIOD_S)
+        except TimeoutError:
+            pass
+        raise NoMotionError(f"the gate did not arm within {patience_s:g} s: {told}")
 
     def close(self) -> None:
         """Leave the graph."""

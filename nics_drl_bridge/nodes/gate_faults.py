@@ -38,7 +38,7 @@ from nics_drl_bridge.nodes.faulty_robot import (
     NoMotionError,
     Robot,
 )
-from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 from nics_drl_bridge.robot.spec import RobotSpec
 
 SOON_S = 0.10
@@ -203,6 +203,8 @@ def _freeze_gate(around: Surroundings) -> None:
     Commands that it wrote before do not count, although the middleware, which freezes with it, may
     send the last one only afterwards.
     """
+    if GATE not in around.processes:
+        return
     pid = around.processes[GATE].pid
     os.kill(pid, signal.SIGSTOP)
     around.robot.until(lambda: False, FROZEN_S)
@@ -306,7 +308,7 @@ class Surroundings(ExitStack):
         self._name = name
         self._tell = tell
         self._fault = FAULTS[name]
-        self._domain_id = free_domain_id()
+        self._domain_id = choose_domain_id()
         model = open_model(setup.model)
         limits = load_limits(setup.limits, model.robot)
         self._low, self._high = find_reach(model.robot, limits)

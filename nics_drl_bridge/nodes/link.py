@@ -191,10 +191,14 @@ class Link:
             raise BackendError("this backend is closed; make another one.")
 
     def call(
-        self, client: Any, request: Any, timeout_s: float, again_s: float = math.inf
+        self,
+        client: Any,
+        request: Any,
+        timeout_s: float,
+        retry_period_s: float = math.inf,
     ) -> Any:
         """Call a service, and again at a period; return the first answer. Raises BackendError."""
-        answer = ask(client, request, timeout_s, self.wait_until, again_s)
+        answer = ask(client, request, timeout_s, self.wait_until, retry_period_s)
         if answer is None:
             reason = f"no answer within {timeout_s:g} s; look at the simulator's log."
             raise BackendError(f"service {client.srv_name}: {reason}")

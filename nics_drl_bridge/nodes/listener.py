@@ -64,9 +64,9 @@ def ask(
     request: Any,
     timeout_s: float,
     wait_until: Callable[[Callable[[], Any], float], bool],
-    again_s: float = math.inf,
+    retry_period_s: float = math.inf,
 ) -> Any:
-    """Call a service, and again at a period [s]; return the first answer, or None if none comes.
+    """Call a service, and again each retry period [s]; return the first answer, or None.
 
     `wait_until` waits for a condition, at most for some seconds, while callbacks run. The
     middleware drops an answer whose client the server has not discovered yet.
@@ -78,10 +78,10 @@ def ask(
         return next((future for future in futures if future.done()), None)
 
     while find_answered() is None and time.monotonic() < deadline:
-        # A server that hung for long was dropped and must be discovered again.
+        # A server that hung for a long time was dropped and must be discovered again.
         wait_until(client.service_is_ready, deadline - time.monotonic())
         futures.append(client.call_async(request))
-        wait_until(find_answered, min(again_s, deadline - time.monotonic()))
+        wait_until(find_answered, min(retry_period_s, deadline - time.monotonic()))
     for future in futures:
         client.remove_pending_request(future)
     answered = find_answered()
@@ -131,7 +131,7 @@ class Listener(Node):
             raise
 
     def start(self) -> None:
-        """Start the thread, once all subscriptions exist."""
+        """Start the thread; create all subscriptions first."""
         self._thread.start()
 
     def close(self) -> None:
@@ -177,13 +177,13 @@ class SpunNode:
         name: str,
         patience_s: float,
         request: Any = None,
-        again_s: float = math.inf,
+        retry_period_s: float = math.inf,
     ) -> Any:
         """Return the answer of a service, asked again at a period. Raises TimeoutError."""
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
         asked = kind.Request() if request is None else request
-        answer = ask(self._clients[name], asked, patience_s, self.until, again_s)
+        answer = ask(self._clients[name], asked, patience_s, self.until, retry_period_s)
         if answer is None:
             raise TimeoutError(f"service {name}: no answer within {patience_s:g} s")
         return answer

@@ -9,13 +9,13 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from functools import cache
-from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from nics_drl_bridge import defaults
 from nics_drl_bridge.config import parse_yaml, read_text
 from nics_drl_bridge.errors import ConfigError, shorten
+from nics_drl_bridge.nodes.transport import is_before_kilted
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 FILE = Path(__file__).with_suffix(".yaml")
@@ -24,8 +24,6 @@ LOCKSTEP = "lockstep"
 MODES = (REALTIME, LOCKSTEP, "as_fast_as_possible")
 NO_POSE = defaults.POSE_TYPE
 POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped")
-# distributions whose robots expect a Twist
-PLAIN_TWISTS = ("humble", "iron", "jazzy")
 STAMPED = "enable_stamped_cmd_vel"
 IMU = "imu"
 BASE_FRAME = "base_frame"
@@ -51,20 +49,6 @@ class Row(NamedTuple):
 def is_stamped_default() -> bool:
     """True if this ROS 2 distribution uses TwistStamped for commands: Kilted and newer."""
     return not is_before_kilted(os.environ.get("ROS_DISTRO", ""))
-
-
-def is_before_kilted(distribution: str) -> bool:
-    """True if a distribution, or the one of the wheels if it is empty, is older than Kilted."""
-    if distribution:
-        return distribution in PLAIN_TWISTS
-    return any(map(_is_wheel, PLAIN_TWISTS))
-
-
-def _is_wheel(name: str) -> bool:
-    try:
-        return bool(distribution(f"ros-{name}-rclpy"))
-    except PackageNotFoundError:
-        return False
 
 
 @cache

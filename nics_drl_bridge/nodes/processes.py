@@ -21,7 +21,7 @@ LAST_DOMAIN_ID = 101  # above it DDS ports may collide with Linux's ephemeral po
 LOG_LINES = 5
 
 
-def free_domain_id() -> int:
+def choose_domain_id() -> int:
     """Return the environment's domain id, or a random unused one. ConfigError if it is invalid."""
     variable = os.environ.get("ROS_DOMAIN_ID")
     if not variable:
@@ -36,12 +36,12 @@ def free_domain_id() -> int:
 
 def unused_domain_id() -> int:
     """Return a random domain id that nobody on this machine uses, unless all are used."""
-    every = range(1, LAST_DOMAIN_ID + 1)
+    allowed = range(1, LAST_DOMAIN_ID + 1)
     own = {
         int(word) for word in [os.environ.get("ROS_DOMAIN_ID", "0")] if word.isdecimal()
     }
-    unused = set(every) - find_used_domains() - own
-    return random.SystemRandom().choice(sorted(unused) or every)
+    unused = set(allowed) - find_used_domains() - own
+    return random.SystemRandom().choice(sorted(unused) or allowed)
 
 
 def make_module_command(module: str) -> list[str]:
@@ -56,7 +56,7 @@ def make_module_command(module: str) -> list[str]:
 
 
 def prepare_child() -> Callable[[], None]:
-    """Return what a child runs first: SIGINT ends it, and on Linux it ends with its parent.
+    """Return what a child runs first: SIGINT ends it, and on Linux the end of its parent thread.
 
     Shells make background jobs ignore SIGINT, as in `make test &`, and children inherit this.
     """
@@ -75,10 +75,10 @@ def prepare_child() -> Callable[[], None]:
 
 def make_command(node: NodeStart, folder: Path) -> list[str]:
     """Return the command line of a node, and write its parameters to a file in a folder."""
-    place = f"/{node.namespace}/{node.executable}".replace("//", "/")
-    # In a parameter file, values for this very node take precedence over those for all nodes.
-    nodes = place if node.params_file else "/**"
-    file = folder / f"{place.strip('/').replace('/', '.')}.yaml"
+    full_name = f"/{node.namespace}/{node.executable}".replace("//", "/")
+    # Values for this very node take precedence over those for all nodes in the user's file.
+    nodes = full_name if node.params_file else "/**"
+    file = folder / f"{full_name.strip('/').replace('/', '.')}.yaml"
     parameters = {nodes: {"ros__parameters": dict(node.parameters)}}
     file.write_text(dump_yaml(parameters, quote_text=True), encoding="utf-8")
     words = [*find_program(node), *node.arguments, "--ros-args"]
@@ -130,7 +130,8 @@ class ChildProcess:
         environment["PYTHONSAFEPATH"] = "1"
         output = None if log is None else log.open("wb")
         try:
-            # In its own session: Ctrl-C in the terminal reaches only the parent, which ends it.
+            # In its own session: Ctrl-C in the terminal reaches only the parent, which then
+            # ends this process.
             self._process = subprocess.Popen(
                 command,
                 env={**os.environ, **environment},

@@ -85,7 +85,7 @@ class RobotTopics:
         self._on_scan = on_scan
         self._on_lidar = on_lidar
         self._reader: Reader | None = Reader(model.lidar, backwards=False)
-        self._header: tuple[float, ...] = ()
+        self._header = b""
         self._told = ""
         # pose and covariance of `initialpose`
         self._placed: tuple[Array, Array] | None = None
@@ -252,13 +252,16 @@ class RobotTopics:
             self._on_scan(stamp)
 
     def _find_reader(self, message: LaserScan) -> Reader | None:
-        header = (
-            message.angle_min,
-            message.angle_increment,
-            message.range_min,
-            message.range_max,
-            len(message.ranges),
-        )
+        # bytes, because NaN does not equal itself
+        header = np.array(
+            [
+                message.angle_min,
+                message.angle_increment,
+                message.range_min,
+                message.range_max,
+                len(message.ranges),
+            ]
+        ).tobytes()
         if header == self._header or self._on_lidar is None:
             return self._reader
         self._header = header

@@ -11,9 +11,8 @@ can select UDP. Otherwise an environment variable is enough.
 import os
 import sys
 from collections.abc import Mapping, MutableMapping
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-
-from nics_drl_bridge.nodes.parameters import is_before_kilted
 
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 LOCAL = "LOCALHOST"
@@ -37,6 +36,22 @@ TABLE = Path("/proc/net/udp")
 FIRST_PORT = 7400
 PORTS_OF_A_DOMAIN = 250
 GREATEST_DOMAIN_ID = 232  # above it, DDS has no ports
+# distributions whose robots expect a Twist
+PLAIN_TWISTS = ("humble", "iron", "jazzy")
+
+
+def is_before_kilted(distribution: str) -> bool:
+    """True if a distribution, or the one of the wheels if it is empty, is older than Kilted."""
+    if distribution:
+        return distribution in PLAIN_TWISTS
+    return any(map(_is_wheel, PLAIN_TWISTS))
+
+
+def _is_wheel(name: str) -> bool:
+    try:
+        return bool(distribution(f"ros-{name}-rclpy"))
+    except PackageNotFoundError:
+        return False
 
 
 def set_transport(environment: MutableMapping[str, str]) -> None:

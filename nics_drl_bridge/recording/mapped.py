@@ -80,9 +80,9 @@ class _Episode(Source):
     """The rows of one episode in a table that holds everything that a mapping reads."""
 
     def __init__(
-        self, source: Source, place: str, table: Table, rows: NDArray[np.intp]
+        self, place: str, name: str, table: Table, rows: NDArray[np.intp]
     ) -> None:
-        super().__init__(place, source.names)
+        super().__init__(place, [name])
         self._table = replace(
             table,
             place=place,
@@ -112,6 +112,7 @@ def _split_table(
     # Stamps that come with the rows continue from one episode to the next.
     if any(each is not table for each in used) or table.stamps("") is not None:
         return []
+    name = next(name for name in source.names if source.get_table(name) is table)
     episodes: list[tuple[str, Source]] = []
     column = table.column(reference)
     _, firsts, groups = np.unique(column, return_index=True, return_inverse=True)
@@ -120,7 +121,7 @@ def _split_table(
         if len(rows) >= MIN_EPISODE_ROWS:
             label = _format_label(column[firsts[k]])
             place = f"{source.place} (episode {label})"
-            episodes.append((label, _Episode(source, place, table, rows)))
+            episodes.append((label, _Episode(place, name, table, rows)))
     if not episodes:
         raise ConfigError(
             f"{table.place}: no value of the column {reference!r} lasts for "
@@ -257,7 +258,7 @@ def _guess_pose_source(source: Source, mapping: DriveMapping) -> MeasuredBy:
 def _read_turn_rate(reader: MappedReader, imu: ImuSource, heading: Value) -> Stream:
     """Reads a second heading as the turn rate that integrates to it, without accelerations."""
     heading = heading.model_copy(update={"unit": heading.unit or "rad"})
-    _check_kind("imu.heading", heading, ("rad",))
+    _check_unit("imu.heading", heading, ("rad",))
     stream = _read_values(reader, "imu", {"heading": heading}, False, imu)
     stream = stream.rows(np.append(True, np.diff(stream.t) > 0.0))
     values = np.zeros((len(stream.t), 3))
@@ -266,12 +267,12 @@ def _read_turn_rate(reader: MappedReader, imu: ImuSource, heading: Value) -> Str
     return replace(stream, values=values)
 
 
-def _check_kind(name: str, value: Value, kinds: Sequence[str]) -> None:
-    """Refuses a value whose unit is not of the needed kind (ConfigError)."""
+def _check_unit(name: str, value: Value, needed: Sequence[str]) -> None:
+    """Refuses a value whose unit is not of one of the needed SI units (ConfigError)."""
     si = get_unit(value).si
-    if si not in kinds:
+    if si not in needed:
         raise ConfigError(
-            f"{name}: is in {si}, where {' or '.join(kinds)} is needed; check its unit."
+            f"{name}: is in {si}, where {' or '.join(needed)} is needed; check its unit."
         )
 
 
@@ -309,7 +310,7 @@ def _read_measured(reader: MappedReader, name: str, source: Measured) -> Stream:
         if value is not None:
             values[key] = value
             if value.unit is not None:
-                _check_kind(f"{name}.{key}", value, kinds)
+                _check_unit(f"{name}.{key}", value, kinds)
     measured = _read_values(reader, name, values, False, source)
     rows = np.zeros((len(measured.t), len(schema.SI[name])))
     rows[:, [list(schema.SI[name]).index(key) for key in values]] = measured.values
@@ -342,7 +343,7 @@ def _read_command_topic(reader: MappedReader, topic: str, spec: RobotSpec) -> St
                 f"robot {spec.name!r} is in {variable.unit}; choose the recorded "
                 "robot, or another topic."
             )
-    values = {field: _read_plainly(f"{topic}:{field}") for field in fields}
+    values = {field: _make_plain_value(f"{topic}:{field}") for field in fields}
     stream = _read_values(reader, "command", values, held=True)
     if not is_steered:
         return replace(stream, values=spec.from_cmd_vel(stream.values))
@@ -368,7 +369,7 @@ def read_pose(
             continue
         usual = pose.heading_unit if key == "heading" else pose.unit
         value = value.model_copy(update={"unit": value.unit or usual})
-        _check_kind(f"pose.{key}", value, kinds[key])
+        _check_unit(f"pose.{key}", value, kinds[key])
         unit = get_unit(value)
         if key == "x":
             kinds["y"] = (unit.si,)
@@ -398,19 +399,24 @@ def _read_heading(
     """Returns the headings of quaternions, without quaternions of length 0."""
     if isinstance(references, str):
         references = [f"{references}.{axis}" for axis in "xyzw"]
-    values = dict(zip("xyzw", map(_read_plainly, references), strict=True))
+    values = dict(zip("xyzw", map(_make_plain_value, references), strict=True))
     stream = _read_values(reader, "pose.quaternion", values, False, pose)
     place = f"{reader.source.place}: pose"
     length = np.linalg.norm(stream.values, axis=1)
     is_lost = length < NO_LENGTH
-    if is_lost.any() and is_lost.mean() <= MOST_UNTRACKED:
-        reader.add_notes(
-            f"pose: {int(is_lost.sum())} of {len(is_lost)} rows without orientation "
-            "were left out."
-        )
+    if is_lost.any():
+        lost = f"{int(is_lost.sum())} of {len(is_lost)} rows"
+        if is_lost.mean() > MOST_UNTRACKED:
+            raise RecordingError(
+                f"{place}: {lost} have a quaternion of length 0: the body was not tracked, "
+                "or the columns are not its own; map other columns, or record the drive again."
+            )
+        reader.add_notes(f"pose: {lost} without orientation were left out.")
         stream = stream.rows(~is_lost)
         length = length[~is_lost]
-    for row in np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)[:1]:
+    wrong = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
+    if len(wrong) > 0:
+        row = wrong[0]
         raise RecordingError(
             f"{place}: {stream.t[row] - stream.t[0]:.3f} s from the start the "
             f"quaternion has the length {length[row]:.3f} and not 1; list its columns "
@@ -430,7 +436,7 @@ def _read_heading(
     return Series(stream.t, headings, stream.clock)
 
 
-def _read_plainly(reference: Reference) -> Value:
+def _make_plain_value(reference: Reference) -> Value:
     """Returns a value that is read as it is."""
     return Value.model_validate({"from": reference})
 
@@ -483,11 +489,12 @@ def _read_deviations(
         references = [f"{references}[{k}]" for k in range(count)]
     columns = []
     for k in schema.COVARIANCES[len(references)]:
-        value = _read_plainly(references[k])
+        value = _make_plain_value(references[k])
         series = reader.read_series(
             "pose.covariance", value, pose, held=False, allow_infinite=True
         )
         is_positive = series.values > 0.0
+        # Both neighbours must be known.
         is_known = np.interp(t, series.t, is_positive) == 1.0
         variance = np.interp(t, series.t, np.where(is_positive, series.values, 0.0))
         columns.append(np.sqrt(np.where(is_known, variance, np.nan)))
@@ -506,7 +513,7 @@ def _read_deviations(
 def _shift_to_zero(
     streams: dict[str, Stream], main_clock: str, reader: MappedReader
 ) -> dict[str, Stream]:
-    """Shifts stamps to start near 0; clocks whose spans overlap share one origin."""
+    """Shifts stamps to start near 0; clocks that overlap the main clock share its origin."""
     spans = _find_spans(streams, reader.source.place)
     _check_durations(streams, reader.source.place)
     start, stop = spans.get(main_clock) or next(iter(spans.values()))

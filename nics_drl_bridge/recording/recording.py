@@ -2,6 +2,7 @@
 
 import io
 import json
+import zipfile
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -374,6 +375,8 @@ def is_recording(path: Path) -> bool:
 
 def _read_arrays(data: bytes) -> dict[str, NDArray[Any]]:
     """Returns the arrays of an `.npz` file. Raises ValueError if it is damaged or too large."""
+    if not zipfile.is_zipfile(io.BytesIO(data)):
+        raise ValueError("it is no zip archive")
     try:
         if files.count_unpacked(io.BytesIO(data)) > files.MOST_BYTES:
             raise ValueError(

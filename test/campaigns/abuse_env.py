@@ -28,7 +28,7 @@ from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.link import Link
 from nics_drl_bridge.nodes.listener import Listener
-from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 
 GRACE_S = 0.25  # after the exception, for the last motion on `cmd_vel`
 WATCH_S = 1.2
@@ -229,7 +229,7 @@ def measure(given: Given) -> Result:
     """Drives and throws so many times; each round takes some seconds."""
     result: Result = dict.fromkeys(BARS, 0) | {"told": []}
     rng = np.random.default_rng(given.seed)
-    domain_id = free_domain_id()
+    domain_id = choose_domain_id()
     parameters = {
         "model": ROBOT,
         "world": "empty",

@@ -28,7 +28,7 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.nodes import command_gate, qos
 from nics_drl_bridge.nodes.faulty_robot import Robot
 from nics_drl_bridge.nodes.load import read_cpu_time
-from nics_drl_bridge.nodes.processes import free_domain_id
+from nics_drl_bridge.nodes.processes import choose_domain_id
 from nics_drl_bridge.nodes.start import start
 
 ROBOT = "ackermann"
@@ -88,7 +88,7 @@ def run_gate(is_busy: bool) -> None:
 
 def measure(given: Given) -> Result:
     """Drives for a time; returns what both processes used of a core, and what came."""
-    domain_id = free_domain_id()
+    domain_id = choose_domain_id()
     words = ["--ros-args"]
     for name, value in PARAMETERS.items():
         words += ["-p", f"{name}:={value}"]

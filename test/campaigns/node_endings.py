@@ -26,7 +26,7 @@ from campaign import Bars, Given, Result, at_most, run_campaign, some_of, tell
 from parts.processes import keep_busy, make_environment
 
 from nics_drl_bridge.nodes.parameters import list_nodes
-from nics_drl_bridge.nodes.processes import free_domain_id
+from nics_drl_bridge.nodes.processes import choose_domain_id
 
 LIMIT_S = 1.0
 PATIENCE_S = 60.0
@@ -84,11 +84,13 @@ def await_line(process: subprocess.Popen[bytes], words: str) -> None:
     told = ""
     late = threading.Timer(READY_S, process.kill)
     late.start()
-    for line in process.stdout or ():
-        told += line.decode(errors="replace")
-        if words in told:
-            late.cancel()
-            return
+    try:
+        for line in process.stdout or ():
+            told += line.decode(errors="replace")
+            if words in told:
+                return
+    finally:
+        late.cancel()
     raise RuntimeError(f"no line {words!r}:\n{told}")
 
 
@@ -96,7 +98,7 @@ def end_node(
     node: str, phase: str, number: int, control: str, folder: Path
 ) -> dict[str, Any]:
     """Ends a node once in a phase; returns times [s], and its code and output if it failed."""
-    environment = make_environment(free_domain_id())
+    environment = make_environment(choose_domain_id())
     environment |= {"ROS_HOME": str(folder), "ROS_LOG_DIR": str(folder)}
     if phase in COLD:
         environment["NUMBA_CACHE_DIR"] = str(folder / "cache")

@@ -16,6 +16,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -187,8 +188,11 @@ def measure_loss(
                 )
             )
         try:
+            late = threading.Timer(2 * PATIENCE_S, parts[0].kill)
+            late.start()
             while DRIVING not in (parts[0].stdout.readline() or DRIVING):
                 pass
+            late.cancel()
             since = time.time()
             cable.lose(0 if control == "no_loss" else percent)
             parts[0].wait(PATIENCE_S + seconds)

@@ -20,7 +20,7 @@ from campaign import Given, Result, at_least, at_most, run_campaign
 from measuring.evaluations import standing_action
 
 from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION, register_envs
-from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 
 SPOILT_STEP = 3
 DRIVEN_M = 0.2  # less is no drive
@@ -62,7 +62,7 @@ class Spoilt(gymnasium.Wrapper):
 def measure_robot(robot: str, robots: int, given: Given) -> dict[str, float]:
     """Drives robots of a kind in both envs and compares every observation."""
     register_envs()
-    domain_id = free_domain_id()
+    domain_id = choose_domain_id()
     world = {"model": robot, "world": given.world}
     about: dict[str, Any] = {"id": NAVIGATION} | world
     if robots > 1:

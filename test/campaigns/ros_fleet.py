@@ -27,7 +27,7 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.listener import SpunNode
 from nics_drl_bridge.nodes.load import read_cpu_time
-from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 
 SCAN_HZ = 10.0
 ODOM_HZ = 50.0
@@ -125,7 +125,7 @@ def write_world(file: Path, robots: int) -> None:
 
 def measure_fleet(robots: int, given: Given) -> Result:
     """Runs a fleet, drives it, and listens to it."""
-    domain_id = free_domain_id()
+    domain_id = choose_domain_id()
     driven = 0 if given.control == "standing" else robots
     heard = robots - 1 if given.control == "deaf" else robots
     with tempfile.TemporaryDirectory() as name:

@@ -27,7 +27,7 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.listener import SpunNode
-from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 
 ROBOT = "differential"
 GOALS = np.array([[1.5, 0.0], [1.5, 1.5], [0.0, 1.5], [-1.5, 0.0], [0.0, -1.5]])
@@ -138,8 +138,8 @@ class Soak:
 
     def __init__(self, stack: ExitStack, control: str | None) -> None:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        field = free_domain_id()
-        track = free_domain_id()
+        field = choose_domain_id()
+        track = choose_domain_id()
         model = {"model": ROBOT}
         gate = model | {"limits": ROBOT, "black_box": str(folder / "black_box")}
         gate |= {"use_sim_time": True, "e_stop_required": False}

@@ -29,7 +29,7 @@ from campaign import (
     some_of,
 )
 
-from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 
 BARS = {
     "sim_conformance_failed": at_most(0),
@@ -44,7 +44,7 @@ def check_conformance(folder: Path, given: Given) -> Result:
     """Counts the announced features, and those that fail, with a sentence about each."""
     from parts.conformance import Client, announced, failures
 
-    domain_id = free_domain_id()
+    domain_id = choose_domain_id()
     space = f"conformance_{os.getpid()}"
     parameters = {"model": "ackermann", "world": "circles"}
     parameters |= {"mode": "realtime", "enable_stamped_cmd_vel": False}

@@ -43,7 +43,7 @@ from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.listener import SpunNode
-from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 
 DRIVER = FOLDER / "parts" / "dart_skid_steer.py"
 # The task ends at this distance from the goal by the estimate; the rest is for its drift [m].
@@ -343,7 +343,7 @@ def start_bridge(workshop: Workshop, control: str | None) -> ExitStack:
 
 def measure(given: Given) -> Result:
     """Records, generates, trains and drives."""
-    domain_id = free_domain_id()
+    domain_id = choose_domain_id()
     with ExitStack() as stack:
         temporary = stack.enter_context(tempfile.TemporaryDirectory())
         folder = (given.folder or Path(temporary)).resolve()

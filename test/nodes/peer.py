@@ -71,11 +71,15 @@ class Peer:
         return publisher
 
     def call(
-        self, kind: Any, service: str, request: Any = None, again_s: float = ANSWERED_S
+        self,
+        kind: Any,
+        service: str,
+        request: Any = None,
+        retry_period_s: float = ANSWERED_S,
     ) -> Any:
         """Return the answer of a service; ask again if none comes."""
         asked = kind.Request() if request is None else request
-        return self._spun.call_service(kind, service, DEADLINE_S, asked, again_s)
+        return self._spun.call_service(kind, service, DEADLINE_S, asked, retry_period_s)
 
     def read_episode(self, simulator: str = "simulator_node") -> dict[str, str]:
         """Return the facts of a simulator about the present episode."""

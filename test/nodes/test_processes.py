@@ -9,7 +9,7 @@ import pytest
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import processes
 from nics_drl_bridge.nodes.listener import holds
-from nics_drl_bridge.nodes.processes import ChildProcess, NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.processes import ChildProcess, NodeProcess, choose_domain_id
 
 pytestmark = [pytest.mark.ros, pytest.mark.process]
 
@@ -93,9 +93,9 @@ def test_a_node_that_ended_by_itself_is_named_with_its_code_and_log(
 
 def test_the_domain_id_is_the_environments_or_drawn(monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", "42")
-    assert free_domain_id() == 42
+    assert choose_domain_id() == 42
     monkeypatch.delenv("ROS_DOMAIN_ID")
-    drawn = {free_domain_id() for _ in range(50)}
+    drawn = {choose_domain_id() for _ in range(50)}
     assert len(drawn) > 10
     assert all(0 < domain_id < 102 for domain_id in drawn)
 
@@ -104,4 +104,4 @@ def test_the_domain_id_is_the_environments_or_drawn(monkeypatch):
 def test_a_wrong_domain_id_of_the_environment_is_one_sentence(monkeypatch, given):
     monkeypatch.setenv("ROS_DOMAIN_ID", given)
     with pytest.raises(ConfigError, match=f"ROS_DOMAIN_ID is '{given}'"):
-        free_domain_id()
+        choose_domain_id()

@@ -40,6 +40,10 @@ FORMATS = ["sdf", "yaml"]
 SUFFIXES = (".sdf", ".yaml", ".yml")
 SHIPPED = "entities"  # folder of the shipped ones, in config/
 MOST_BYTES = 2**24  # of a file
+# A search takes time in the power of the repetitions, and exponential time where one is repeated.
+MOST_REPETITIONS = 3
+REPETITION = re.compile(r"(?<!\\)[*+{]")
+REPEATED = re.compile(r"(?<!\\)\)[*+{]")
 LEAN = 0.02  # maximum angle of what stands upright [rad]
 # With room for the names of topics, which may have 255 characters in all.
 NAMESPACE = re.compile(
@@ -70,6 +74,9 @@ class EntityServices:
         if filters != EntityFilters(filter=text):
             fault = "entities are filtered by name alone; leave out all else."
             raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, fault)
+        if len(REPETITION.findall(text)) > MOST_REPETITIONS or REPEATED.search(text):
+            fix = f"repeat no group, and use at most {MOST_REPETITIONS} repetitions"
+            raise RefusalError(FAILED, f"the filter {text!r} may take hours; {fix}.")
         try:
             pattern = re.compile(text)
         except re.error as error:

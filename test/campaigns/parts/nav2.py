@@ -16,7 +16,7 @@ from tf2_msgs.msg import TFMessage
 
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.listener import SpunNode
-from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.occupancy import occupancy, standing
 from nics_drl_bridge.sim.scenes import SceneSampler
@@ -34,7 +34,7 @@ SUCCEEDED = 4
 
 def follow_paths(folder: Path, episodes: int, is_bare: bool) -> list[str]:
     """Has planned paths followed over DDS; returns a line for each that was not."""
-    domain_id = free_domain_id()
+    domain_id = choose_domain_id()
     radius = load_robot(ROBOT).footprint_radius
     worlds = load_worlds(WORLD)
     sampler = SceneSampler(worlds, radius)
@@ -84,7 +84,7 @@ def begin_episode(tree: StandIn, seed: int, cells: bytes) -> None:
 
 def find_missing(folder: Path, file: Path, is_bare: bool) -> list[str]:
     """Returns a line for each name of a parameter file of Nav2 that nobody serves."""
-    domain_id = free_domain_id()
+    domain_id = choose_domain_id()
     topics, frames = nav2_names.read_wanted(file)
     model = {"model": ROBOT}
     frame = "" if is_bare else "base_footprint"
