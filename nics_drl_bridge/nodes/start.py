@@ -13,7 +13,6 @@ from typing import Any
 
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.nodes import own_process, transport
-from nics_drl_bridge.nodes.parameters import describe_node, list_nodes
 
 HELP = ("-h", "--help")
 ROS = "--ros-args"
@@ -23,6 +22,9 @@ WIDTH = 100
 
 def format_help(node: str) -> str:
     """Return the help of a node by the name of its executable."""
+    # It needs pydantic, whose absence `_load_main` explains.
+    from nics_drl_bridge.nodes.parameters import describe_node, list_nodes
+
     if node not in list_nodes():
         return f"usage: {node} [{ROS} -p NAME:=VALUE -r FROM:=TO ...]\n"
     facts = describe_node(node)

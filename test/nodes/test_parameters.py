@@ -9,7 +9,7 @@ from rclpy.parameter import Parameter
 from nics_drl_bridge.config import find_config, list_shipped, share_folder
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.nodes import parameters, runner
+from nics_drl_bridge.nodes import runner, transport
 from nics_drl_bridge.nodes.parameters import (
     describe_node,
     find_frame_fault,
@@ -143,9 +143,9 @@ def test_commands_are_stamped_since_kilted(monkeypatch, distribution, stamped):
 
 def test_without_a_sourced_distribution_its_wheels_tell_which_it_is(monkeypatch):
     monkeypatch.delenv("ROS_DISTRO", raising=False)
-    monkeypatch.setattr(parameters, "_is_wheel", lambda name: name == "jazzy")
+    monkeypatch.setattr(transport, "_is_wheel", lambda name: name == "jazzy")
     assert not is_stamped_default()
-    monkeypatch.setattr(parameters, "_is_wheel", lambda name: False)
+    monkeypatch.setattr(transport, "_is_wheel", lambda name: False)
     assert is_stamped_default()
 
 
