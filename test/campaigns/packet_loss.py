@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 from campaign import FOLDER, Bar, Bars, Given, Result, at_least, at_most, run_campaign
-from gate_faults import HIGH, LOW, ROBOT, TWIST
+from gate_faults import ROBOT, TWIST
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from parts.lossy_link import Link, NoNamespacesError, open_link
@@ -46,6 +46,9 @@ OLDEST_S = 0.40
 SENT_SHARES = (0.8, 1.2)
 REPEAT_S = 0.02
 SLOW_SKIP = 3
+# limits of the robot's twist [m/s, m/s, rad/s]
+LOW = np.array([0.0, 0.0, -0.5])
+HIGH = np.array([1.0, 0.0, 0.5])
 GATE = ("reset", "arm")
 PATIENCE_S = 90.0
 STANDING_S = 5.0
