@@ -142,28 +142,29 @@ def estimate_motion(
     stride = math.ceil(len(new.ranges) / COMPARED_BEAMS)
     is_return = np.isfinite(new.ranges[::stride])
 
-    def find_agreeing(motion: Array) -> Flags:
-        agreeing = np.empty(len(is_return), np.bool_)
+    def find_agreeing(motions: Array) -> Flags:
+        agreeing = np.empty((len(motions), len(is_return)), np.bool_)
         evidence_kernels.mark_agreeing(
-            agreeing, new.ranges, old.ranges, lidar, motion, tolerance, stride
+            agreeing, new.ranges, old.ranges, lidar, motions, tolerance, stride
         )
         return agreeing
 
-    usual = find_agreeing(by_odometry)
+    usual = find_agreeing(by_odometry[None])[0]
     needed = max(
         np.count_nonzero(usual) + MIN_GAIN * len(usual), MIN_AGREEING * len(usual)
     )
     if np.count_nonzero(is_return) < needed:
         return by_odometry  # no motion can fit better
     motions = np.concatenate([_vary_turn(by_odometry), _lessen_motion(by_odometry)])
+    agreeing_by_motion = find_agreeing(motions)
     # among equals, the turn closest to odometry's
-    best = max(motions, key=lambda motion: np.count_nonzero(find_agreeing(motion)))
-    agreeing = find_agreeing(best)
+    best = int(np.argmax(np.count_nonzero(agreeing_by_motion, axis=1)))
+    agreeing = agreeing_by_motion[best]
     gained = np.flatnonzero(agreeing & ~usual) * stride
     is_better = np.count_nonzero(agreeing) >= needed
     if not is_better or _count_sectors(gained, lidar) < MIN_SECTORS:
         return by_odometry
-    by_scans: Array = best
+    by_scans: Array = motions[best]
     return by_scans
 
 

@@ -92,33 +92,35 @@ def mark_agreeing(
     ranges: Ranges,
     old_ranges: Ranges,
     lidar: MountedBeams,
-    moved: Array,
+    motions: Array,
     tolerance: Tolerance,
     stride: int,
 ) -> None:
     """Takes every `stride`-th beam, and marks those that end where the old scan ended.
 
     Args:
-        agreeing: (ceil(B / stride),) flags, set or cleared.
+        agreeing: (n, ceil(B / stride)) flags, set or cleared, for each motion.
         ranges: (B,) of the scan [m].
         old_ranges: (B,) of the old scan [m].
         lidar: its beams.
-        moved: (3,) motion since the old scan, in the robot's frame then: x, y [m], heading [rad].
+        motions: (n, 3) possible motions since the old scan, in the robot's frame then:
+            x, y [m], heading [rad].
         tolerance: by which the ends may differ.
         stride: number of beams from one that is compared to the next.
     """
     beams = len(ranges)
     whole_circle = round(2.0 * math.pi / abs(lidar.step))
-    for k in range(len(agreeing)):
-        agreeing[k] = False
+    agreeing[:] = False
+    for k in range(agreeing.shape[1]):
         beam = k * stride
         if not np.isfinite(ranges[beam]):
             continue
-        distance, middle = find_in_old_scan(ranges[beam], beam, lidar, moved)
-        index = middle % whole_circle
-        if index < beams:
-            allowed = tolerance.constant + tolerance.proportional * distance
-            agreeing[k] = abs(distance - old_ranges[index]) <= allowed
+        for i in range(len(motions)):
+            distance, middle = find_in_old_scan(ranges[beam], beam, lidar, motions[i])
+            index = middle % whole_circle
+            if index < beams:
+                allowed = tolerance.constant + tolerance.proportional * distance
+                agreeing[i, k] = abs(distance - old_ranges[index]) <= allowed
 
 
 @kernel

@@ -349,8 +349,11 @@ def warm_up() -> None:
     ranges = np.ones(1, np.float32)
     tolerance = Tolerance(0.0, 0.0)
     entered = np.zeros(1, np.bool_)
+    agreeing = np.zeros((1, 1), np.bool_)
     still = np.zeros(3)
-    evidence_kernels.mark_agreeing(entered, ranges, ranges, lidar, still, tolerance, 1)
+    evidence_kernels.mark_agreeing(
+        agreeing, ranges, ranges, lidar, still[None], tolerance, 1
+    )
     evidence_kernels.mark_entered(entered, ranges, ranges, lidar, still, 1.0, tolerance)
     view = View(0, np.zeros(3), ranges)
     before: Ground | None = None
