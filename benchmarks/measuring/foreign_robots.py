@@ -8,7 +8,6 @@ What a recorder sees: commands at 20 Hz that act after a latency, poses of a mot
 tracked body sits somewhere on the robot, or encoders that overflow. Everything follows from a seed.
 """
 
-import csv
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ import yaml
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.recording.recording import Stream
 
 STEP_S = 0.001
 COMMAND_S = 0.05
@@ -270,34 +269,22 @@ class ForeignDrive:
     pose: Stream  # (T, 3) of the tracked body
     command: Stream  # (T, C), or counters of encoders before they overflow
 
-    def recording(self) -> Recording:
-        """Returns the streams; counters as the wheel speeds [rad/s] up to the next stamp."""
-        command = self.command
-        turn = self.robot.ticks_per_turn
-        if turn:
-            speed = np.diff(command.values, axis=0) / np.diff(command.t)[:, None]
-            command = Stream(command.t[:-1], speed * 2.0 * np.pi / turn)
-        return Recording(command, self.pose, source=self.robot.robot["kind"])
-
     def write(self, folder: Path) -> Path:
         """Writes CSV with headers into a folder and returns the mapping to read it by."""
         folder.mkdir(parents=True, exist_ok=True)
         values = self.command.values
         counts = self.robot.ticks_per_turn
-        _write_csv(
-            folder / "poses.csv", ("x", "y", "yaw"), self.pose.t, self.pose.values
-        )
+        poses = folder / "poses.csv"
+        _write_csv(poses, ("x", "y", "yaw"), self.pose.t, self.pose.values)
         _write_csv(
             folder / "commands.csv",
             tuple(self.robot.commands),
             self.command.t,
-            np.mod(values, COUNTER).astype(int) if counts else values,
+            np.mod(values, COUNTER) if counts else values,
         )
-        extra = (
-            {"unit": "ticks", "ticks_per_turn": counts, "wrap": COUNTER}
-            if counts
-            else {}
-        )
+        extra = {}
+        if counts:
+            extra = {"unit": "ticks", "ticks_per_turn": counts, "wrap": COUNTER}
         mapping = {
             "robot": self.robot.robot,
             "time": "stamp",
@@ -374,9 +361,6 @@ def _varied(rng: np.random.Generator, t: Array, low: float, high: float) -> Arra
 
 
 def _write_csv(path: Path, names: tuple[str, ...], t: Array, values: Array) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow(("stamp", *names))
-        rows.writerows(
-            (f"{a:.4f}", *row) for a, row in zip(t, values.tolist(), strict=True)
-        )
+    head = ",".join(("stamp", *names))
+    rows = np.column_stack([t, values])
+    np.savetxt(path, rows, "%.17g", ",", header=head, comments="")

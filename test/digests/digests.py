@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -145,11 +146,12 @@ def motion_state_terms() -> Found:
     from measuring.foreign_robots import foreign_drive
 
     from nics_drl_bridge.identify.identify import identify
-    from nics_drl_bridge.robot.spec import build_robot
+    from nics_drl_bridge.recording.readers import open_drive
 
-    robot = FOREIGN["skid_steer"]
-    recording = foreign_drive(robot, 11, 8.0).recording()
-    spec = build_robot(robot.robot, robot.commands)
+    drive = foreign_drive(FOREIGN["skid_steer"], 11, 8.0)
+    with TemporaryDirectory() as folder:
+        source = Path(folder) / "drive"
+        spec, recording = open_drive(source, None, drive.write(source))
     terms = identify(recording, spec, alpha=0.99).model.named.terms
     return {rate: sorted(row) for rate, row in terms.items()}
 
