@@ -62,7 +62,7 @@ DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Ma
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test test-quick test-docs test-package test-campaign test-all ros-status lint format types pytest benchmark wheel tables docs reference notebooks pictures clean distclean
+.PHONY: help setup demo test test-quick test-docs test-package test-campaign test-all ros-status lint format types pytest benchmark wheel tables docs models reference notebooks pictures clean distclean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
@@ -196,6 +196,9 @@ tables: setup ## make the tables of README and docs from benchmarks/results.json
 docs: setup ## build the site of docs/ into build/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "to read and search it: open build/docs/index.html in a browser"
+
+models: setup ## generate config/models/ anew, after a change of the generator or of a shipped robot
+	$(BIN)/python test/shipped_models.py
 
 reference: setup ## make docs/reference/ from file schemas, commands and nodes
 	$(BIN)/python docs/site/reference.py

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -15,17 +15,21 @@ from nics_drl_bridge.arguments import check_arguments, check_path, format_value
 from nics_drl_bridge.config import (
     Schema,
     dump_yaml,
+    find_config,
     list_shipped,
     parse_yaml,
     read_text,
     validate,
 )
 from nics_drl_bridge.errors import ConfigError, FitError, ModelError, suggest
-from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.drive import Settings
-from nics_drl_bridge.identify.identify import Identified, identify, join_recordings
-from nics_drl_bridge.identify.report import explain_uselessness, format_report
+from nics_drl_bridge.identify.settings import (
+    Alpha,
+    Order,
+    Settings,
+    parse_alpha,
+    parse_order,
+)
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.sensor import AnySensor, Sensor, check_sensors
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Shape
@@ -36,6 +40,9 @@ from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.noise import Latency, Noise
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.identify.identify import Identified
 
 FORMATS = "nics_drl_bridge/simulator_model/"  # common prefix of all versions
 FORMAT = f"{FORMATS}4"
@@ -172,13 +179,13 @@ def generate(
     robot: RobotSpec | SimulatorModel | str | Path,
     lidar: LidarSpec | str | Path | None = None,
     shapes: Sequence[Shape] = (),
-    order: fit.Order = Settings.order,
-    alpha: fit.Alpha = Settings.alpha,
+    order: Order = Settings.order,
+    alpha: Alpha = Settings.alpha,
     assume: bool = Settings.assume,
     strict: bool = Settings.strict,
     anyway: bool = False,
     sensors: Sequence[Sensor] = (),
-) -> tuple[SimulatorModel, Identified]:
+) -> "tuple[SimulatorModel, Identified]":
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
     Raises RecordingError if the recording does not fit the robot, FitError if the model is useless.
@@ -196,9 +203,13 @@ def generate(
         anyway: True accepts a model that predicts hardly better than a robot at rest.
         sensors: sensors besides the lidar.
     """
+    # It takes time to load, and most users open a model that was generated before.
+    from nics_drl_bridge.identify.identify import identify, join_recordings
+    from nics_drl_bridge.identify.report import explain_uselessness, format_report
+
     _check_given(recording, shapes, sensors)
-    alpha = fit.parse_alpha(str(alpha))
-    order = fit.parse_order(str(order))
+    alpha = parse_alpha(str(alpha))
+    order = parse_order(str(order))
     robot = _get_spec(robot)
     if not isinstance(lidar, LidarSpec):
         lidar = mount_lidar(robot, None if lidar is None else str(lidar))
@@ -282,15 +293,27 @@ def mount_lidar(robot: RobotSpec, name: str | None = None) -> LidarSpec:
 def builtin_model(robot: str, content: str = "") -> SimulatorModel:
     """Returns a model with the textbook kinematics of a shipped robot or a robot's YAML file.
 
-    Each model is generated once; for a file, once for each `content`.
+    Each model is made once; for a file, once for each `content`. That of a shipped robot is
+    shipped, too, and not generated unless the robot or its lidar was edited.
     """
     spec = load_robot(robot)
     if Path(robot, MODEL_FILE).is_file():
         sys.stderr.write(
             f"nics_drl_bridge: {robot!r} is shipped; the folder is ./{robot}\n"
         )
-    drive = textbook.record(spec, np.random.default_rng(BUILTIN_SEED))
-    return generate(drive, spec, mount_lidar(spec), ())[0]
+    if robot in list_shipped("models"):
+        path = find_config(robot, "models")
+        file = _read_file(path)
+        if (file.robot, file.lidar) == (spec, mount_lidar(spec)):
+            table = bake(file.lidar, [footprint_shape(spec)])
+            return _assemble(file, table, read_text(path.with_suffix(".txt")))
+    return generate_textbook_model(spec)
+
+
+def generate_textbook_model(robot: RobotSpec) -> SimulatorModel:
+    """Generates a model from a drive of a robot that moves as its textbook says."""
+    drive = textbook.record(robot, np.random.default_rng(BUILTIN_SEED))
+    return generate(drive, robot, mount_lidar(robot), ())[0]
 
 
 def open_model(
@@ -367,11 +390,24 @@ def load_model(folder: str | Path) -> SimulatorModel:
             f"{folder}: contains no {MODEL_FILE}; make a model with `nics generate`."
         )
     inode = folder.stat().st_ino
+    file = _read_file(path)
+    files.check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
+    table = LidarTable.load(folder / TABLE_FOLDER, checked=True)
+    report = read_text(folder / REPORT_FILE)
+    if folder.stat().st_ino != inode:
+        raise ModelError(f"{folder}: was replaced while it was read; open it again.")
+    try:
+        return _assemble(file, table, report)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from None
+
+
+def _read_file(path: Path) -> _File:
+    """Reads the YAML file of a model. Raises ConfigError, ModelError."""
     data = parse_yaml(read_text(path), str(path))
     if data.get("format") != FORMAT:
         reason = f"key 'format' is {data.get('format')!r}, not {FORMAT!r}"
         raise ModelError(f"{path}: {reason}; generate the model again.")
-    files.check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
     # A file without this key was written before its default changed.
     if isinstance(data.get("robot"), dict):
         data["robot"].setdefault("angular_is", "steering")
@@ -382,13 +418,10 @@ def load_model(folder: str | Path) -> SimulatorModel:
             raise ConfigError(
                 f"{path}: the key 'calibration.{key.name}' is missing; add it."
             )
-    table = LidarTable.load(folder / TABLE_FOLDER, checked=True)
-    report = read_text(folder / REPORT_FILE)
-    if folder.stat().st_ino != inode:
-        raise ModelError(f"{folder}: was replaced while it was read; open it again.")
-    try:
-        parts = vars(file) | {"kinematics": file.kinematics.model()}
-        del parts["format"]
-        return SimulatorModel(**parts, table=table, report=report)
-    except ModelError as error:
-        raise ModelError(f"{path}: {error}") from None
+    return file
+
+
+def _assemble(file: _File, table: LidarTable, report: str) -> SimulatorModel:
+    parts = vars(file) | {"kinematics": file.kinematics.model()}
+    del parts["format"]
+    return SimulatorModel(**parts, table=table, report=report)

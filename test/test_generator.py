@@ -7,7 +7,12 @@ import pytest
 from robots import circles, direct_model, field
 
 from nics_drl_bridge import generator
-from nics_drl_bridge.config import dump_yaml, find_config, parse_yaml
+from nics_drl_bridge.config import (
+    dump_yaml,
+    find_config,
+    list_shipped,
+    parse_yaml,
+)
 from nics_drl_bridge.errors import BridgeError, ConfigError, ModelError
 from nics_drl_bridge.files import SUMS
 from nics_drl_bridge.generator import (
@@ -15,6 +20,7 @@ from nics_drl_bridge.generator import (
     MODEL_FILES,
     TABLE_FOLDER,
     builtin_model,
+    generate_textbook_model,
     load_model,
     open_model,
     save_model,
@@ -22,6 +28,7 @@ from nics_drl_bridge.generator import (
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.robot.noise import Delay, Latency, Level
+from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.simulator import FastSimulator
 
 
@@ -160,6 +167,34 @@ def test_a_shipped_robot_goes_before_a_folder_of_its_name_which_is_told(
         open_model(Path("./differential")).robot.name == "ackermann"
     )  # which drops the "./"
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("name", list_shipped("robots"))
+def test_a_shipped_model_is_what_is_generated(name):
+    """After a change of the generator or of a robot: `make models`."""
+    shipped = builtin_model(name)
+    made = generate_textbook_model(shipped.robot)
+    assert parse_yaml(shipped.text, "shipped") == approx(parse_yaml(made.text, "made"))
+    assert shipped.table.fingerprint == made.table.fingerprint
+
+
+def approx(data):
+    """Nested data whose numbers may differ by rounding, as on another machine."""
+    if isinstance(data, dict):
+        return {key: approx(value) for key, value in data.items()}
+    if isinstance(data, list):
+        return [approx(value) for value in data]
+    if isinstance(data, float):
+        return pytest.approx(data, rel=1e-6, abs=1e-9)
+    return data
+
+
+def test_an_edited_robot_gets_a_model_of_its_own(monkeypatch):
+    edited = load_robot("differential").model_copy(update={"footprint_radius": 0.5})
+    monkeypatch.setattr(generator, "load_robot", lambda name: edited)
+    model = builtin_model.__wrapped__("differential")
+    assert model.robot == edited
+    assert (model.table.shapes[0].radius, model.report == "") == (0.5, False)
 
 
 def test_a_robots_file_that_has_changed_is_opened_anew(tmp_path):

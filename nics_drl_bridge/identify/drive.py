@@ -7,9 +7,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge import defaults, geometry
+from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.fit import Alpha, Order
+from nics_drl_bridge.identify.settings import Settings
 from nics_drl_bridge.identify.signals import (
     DIFFERENCE,
     DIFFERENCE_GAIN,
@@ -33,20 +33,6 @@ REST_DRIFT = 3.0  # standard errors at rest; straight motion shows at least 4
 SLOPE_NOISE = 0.05
 MAX_SPAN_S = 0.2
 MAX_GAP_S = 0.25
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Options of an identification."""
-
-    order: Order = defaults.TAYLOR_ORDER  # of the Taylor expansion (Eq. 1), or `auto`
-    alpha: Alpha = defaults.PRUNING  # of the pruning (Eq. 2), or `auto`
-    # end of the training part, measured from the first pose
-    train_until_s: float = float("inf")
-    # complete the model by the textbook for inputs that never moved
-    assume: bool = False
-    strict: bool = False  # refuse a drive that did not move every input independently
-    control_period_s: float = 0.1  # the model's step must divide this
 
 
 @dataclass(frozen=True, eq=False)

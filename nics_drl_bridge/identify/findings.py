@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from nics_drl_bridge.identify import clocks, hypotheses
-from nics_drl_bridge.identify.calibration import Calibration, align, resample_motion
+from nics_drl_bridge.identify.alignment import align, resample_motion
+from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import Fit, Regression
 from nics_drl_bridge.identify.mounting import Mounting

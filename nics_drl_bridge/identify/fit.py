@@ -11,19 +11,18 @@ sizes of terms can be compared.
 """
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import compress
-from typing import Literal
 
 import numpy as np
 import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
 
-from nics_drl_bridge.errors import ConfigError, FitError
+from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import statistics
+from nics_drl_bridge.identify.settings import Alpha
 from nics_drl_bridge.identify.signals import GAUSSIAN_MAD, measure_white_noise
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.robot import taylor
@@ -305,8 +304,6 @@ def _measure_own_shares(x: Array) -> Array:
     return shares
 
 
-Alpha = float | Literal["auto"]
-Order = int | Literal["auto"]
 # From the exponents (K, V) of features, selects the terms (D, K) that a model may have.
 TermFilter = Callable[[NDArray[np.int64], RobotSpec], NDArray[np.bool_]]
 
@@ -319,24 +316,6 @@ LEAST_RATE = 1e-9  # that rate is at least so large [unit of the rate]
 # A row is one step after the previous one if it is within this fraction of a step, and this time.
 STEP_TOLERANCE = 1e-3
 STEP_TOLERANCE_S = 1e-6
-
-
-def parse_alpha(text: str) -> Alpha:
-    """Parses a pruning threshold: a number from 0 to 1, or `auto`; else ConfigError."""
-    if text == "auto":
-        return "auto"
-    with suppress(ValueError):
-        value = float(text)
-        if 0.0 <= value <= 1.0:
-            return value
-    raise ConfigError(f"alpha is {text!r}; it must be a number from 0 to 1, or auto.")
-
-
-def parse_order(text: str) -> Order:
-    """Parses the order of a model: 1 to 4, or `auto`; else ConfigError."""
-    if text not in ("auto", "1", "2", "3", "4"):
-        raise ConfigError(f"order is {text!r}; it must be 1, 2, 3 or 4, or auto.")
-    return "auto" if text == "auto" else int(text)
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
-from nics_drl_bridge.identify.calibration import (
-    Calibration,
-    choose_half_width,
-    smooth_commands,
-)
+from nics_drl_bridge.identify.alignment import choose_half_width, smooth_commands
+from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import MIDDLE_OF_STEP, roll
 from nics_drl_bridge.identify.signals import (

@@ -22,9 +22,7 @@ from nics_drl_bridge.identify import clocks as timings
 from nics_drl_bridge.identify import fit as fitting
 from nics_drl_bridge.identify import judgement as judging
 from nics_drl_bridge.identify import open_loop, verdict
-from nics_drl_bridge.identify.calibration import (
-    Calibration,
-    Response,
+from nics_drl_bridge.identify.alignment import (
     add_motion,
     align,
     choose_half_width,
@@ -32,7 +30,8 @@ from nics_drl_bridge.identify.calibration import (
     make_motion_grid,
     make_surrogate,
 )
-from nics_drl_bridge.identify.drive import Drive, Settings
+from nics_drl_bridge.identify.calibration import Calibration, Response
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.findings import (
     Findings,
     require,
@@ -68,6 +67,7 @@ from nics_drl_bridge.identify.repair import (
     correct_heading_by_gyro,
     repair_rows,
 )
+from nics_drl_bridge.identify.settings import Alpha, Order, Settings
 from nics_drl_bridge.identify.textbook_model import (
     add_actuator_state,
     assume_textbook,
@@ -92,8 +92,8 @@ Stage = Callable[[Drive, Findings], Findings]
 def identify(
     recording: Recording,
     spec: RobotSpec,
-    order: fitting.Order = Settings.order,
-    alpha: fitting.Alpha = Settings.alpha,
+    order: Order = Settings.order,
+    alpha: Alpha = Settings.alpha,
     train_until: float | None = None,
     assume: bool = Settings.assume,
     strict: bool = Settings.strict,
@@ -255,7 +255,7 @@ class Identified:
         return _find_dead_zone(self.model, driving)
 
     @property
-    def alpha(self) -> fitting.Alpha:
+    def alpha(self) -> Alpha:
         """Threshold of the pruning; `auto` for the knee of the accuracy curve."""
         return self.drive.settings.alpha
 

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify import clocks
-from nics_drl_bridge.identify.calibration import Calibration, has_motion_as_state
+from nics_drl_bridge.identify.alignment import has_motion_as_state
+from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import (
     average_held,

@@ -26,8 +26,9 @@ from nics_drl_bridge.identify.findings import (
     require_samples,
     resample_drive,
 )
-from nics_drl_bridge.identify.fit import ORDER, Order
+from nics_drl_bridge.identify.fit import ORDER
 from nics_drl_bridge.identify.forms import Evidence
+from nics_drl_bridge.identify.settings import Order
 from nics_drl_bridge.identify.terms import (
     Kind,
     Library,

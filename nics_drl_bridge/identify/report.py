@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nics_drl_bridge.identify.fit import Alpha, describe_narrow_commands
+from nics_drl_bridge.identify.fit import describe_narrow_commands
 from nics_drl_bridge.identify.hypotheses import PRUNING, list_candidates
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.judgement import (
@@ -18,6 +18,7 @@ from nics_drl_bridge.identify.judgement import (
     select_usual_horizon,
 )
 from nics_drl_bridge.identify.repair import describe_reference
+from nics_drl_bridge.identify.settings import Alpha
 from nics_drl_bridge.identify.signals import select_moved_commands
 from nics_drl_bridge.identify.statistics import Curve
 from nics_drl_bridge.identify.verdict import (

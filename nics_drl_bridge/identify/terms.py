@@ -30,7 +30,6 @@ from nics_drl_bridge.identify.fit import (
     ORDER,
     STILL,
     TOGETHER,
-    Alpha,
     Fit,
     Regression,
     find_constant_combinations,
@@ -40,6 +39,7 @@ from nics_drl_bridge.identify.fit import (
     regress,
     select_twist_terms,
 )
+from nics_drl_bridge.identify.settings import Alpha
 from nics_drl_bridge.identify.signals import find_speed_index
 from nics_drl_bridge.identify.yardstick import probe_structure
 from nics_drl_bridge.recording.recording import Samples

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.calibration import Calibration, Response, require_state
+from nics_drl_bridge.identify.alignment import require_state
+from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.signals import infer_states, list_followed_commands
 from nics_drl_bridge.identify.verdict import Gap

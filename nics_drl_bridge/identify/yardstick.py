@@ -11,11 +11,8 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.calibration import (
-    Calibration,
-    choose_half_width,
-    measure_body_twists,
-)
+from nics_drl_bridge.identify.alignment import choose_half_width, measure_body_twists
+from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.kernels import STRAIGHT, BicycleGeometry, roll_windows
 from nics_drl_bridge.identify.open_loop import Windows, select_windows

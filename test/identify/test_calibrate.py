@@ -9,12 +9,8 @@ from pydantic import TypeAdapter
 
 from identify.drives import NOISE, add_wheels, calibrate, drive
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.identify.calibration import (
-    Calibration,
-    Response,
-    align,
-    find_dividing_step,
-)
+from nics_drl_bridge.identify.alignment import align, find_dividing_step
+from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.recording.recording import samples_on_one_clock
 from nics_drl_bridge.recording.textbook import record

@@ -9,9 +9,8 @@ import pytest
 from scipy.signal import savgol_filter
 
 from identify.drives import fit_trial, slipping_car
-from nics_drl_bridge.identify.calibration import (
+from nics_drl_bridge.identify.alignment import (
     WIDTHS_S,
-    Calibration,
     add_motion,
     choose_half_width,
     find_slopes,
@@ -22,6 +21,7 @@ from nics_drl_bridge.identify.calibration import (
     resample_motion,
     smooth_commands,
 )
+from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record

@@ -19,7 +19,8 @@ from identify.drives import (
 )
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.identify.calibration import Calibration, align
+from nics_drl_bridge.identify.alignment import align
+from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import identify

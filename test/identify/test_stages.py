@@ -12,12 +12,13 @@ from nics_drl_bridge.identify import clocks, verdict
 from nics_drl_bridge.identify import identify as stages
 from nics_drl_bridge.identify.calibration import Response
 from nics_drl_bridge.identify.clocks import make_nominal_timing
-from nics_drl_bridge.identify.drive import Drive, Settings
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.findings import StageOrderError
 from nics_drl_bridge.identify.identify import (
     STAGES,
     run,
 )
+from nics_drl_bridge.identify.settings import Settings
 from nics_drl_bridge.identify.verdict import describe_responses
 from nics_drl_bridge.robot.spec import RobotSpec
 

@@ -10,9 +10,12 @@ import numpy as np
 
 from nics_drl_bridge.env.task import still
 from nics_drl_bridge.env.tasks.navigation import Navigation
-from nics_drl_bridge.generator import BUILTIN_SEED, CONTROL_PERIOD_S, SimulatorModel
+from nics_drl_bridge.generator import (
+    CONTROL_PERIOD_S,
+    SimulatorModel,
+    generate_textbook_model,
+)
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.policy.planners import local_map as maps
 from nics_drl_bridge.policy.planners.local_map_kernels import (
@@ -27,7 +30,6 @@ from nics_drl_bridge.policy.planners.mppi_kernels import (
     draw,
     plan_all,
 )
-from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.robot.braking import Braking, find_braking
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, replace_coefficients
 from nics_drl_bridge.robot.kinds import compute_steady_twist
@@ -113,9 +115,7 @@ class Mppi:
     def _kinematics(self) -> TaylorModel:
         if self.model is not None:
             return self.model.kinematics
-        robot = self.task.robot
-        drive = textbook.record(robot, np.random.default_rng(BUILTIN_SEED))
-        return identify(drive, robot).model
+        return generate_textbook_model(self.task.robot).kinematics
 
     @property
     def _period(self) -> float:
