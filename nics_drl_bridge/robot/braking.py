@@ -13,7 +13,6 @@ from itertools import combinations, product
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
@@ -502,17 +501,36 @@ def _fit_tightest(
         worst = _compute_envelope(counted_speed, distance[counts])
     weight = 1.0 / (worst + SLACK_M)
     ahead = counted_speed * weight
-    cost = np.array([ahead.mean(), (ahead * counted_pace).mean()])
+    cost = ahead.mean()
+    cost_of_pace = (ahead * counted_pace).mean()
     times = distance / speed
-    rows = np.stack([-speed, -speed * pace], axis=-1)
-    result = scipy.optimize.linprog(cost, rows, -distance, bounds=(0.0, None))
-    if not result.success:
+    if not np.isfinite(times).all():
         return _Fit(slack=math.inf, reaction_s=float(times.max()), inverse=0.0)
-    reaction, inverse = result.x
-    slack = float(cost @ result.x - (worst * weight).mean())
-    # The solver meets each bound up to its tolerance.
-    reaction += max((times - reaction - pace * inverse).max(), 0.0)
-    return _Fit(slack, float(reaction), float(inverse))
+    reaction, inverse = find_lowest_line(pace, times, cost_of_pace / cost)
+    slack = cost * reaction + cost_of_pace * inverse - (worst * weight).mean()
+    # A rounding error must not lower the bound.
+    reaction += max(float((times - reaction - pace * inverse).max()), 0.0)
+    return _Fit(float(slack), reaction, inverse)
+
+
+def find_lowest_line(x: Array, y: Array, at: float) -> tuple[float, float]:
+    """Returns the line above all points (x, y), each (K,), that is lowest at an x >= 0.
+
+    Returns its intercept and its slope, of which neither is negative. No x is negative.
+    """
+    x = np.append(x, 0.0)  # above the origin, the intercept is not negative
+    y = np.append(y, 0.0)
+    # A level line touches the highest point. The steeper it is, the further left is the point that
+    # it touches, and around a point right of `at` it sinks there.
+    touched = int(np.argmax(y))
+    slope = 0.0
+    while x[touched] > at:
+        left = np.flatnonzero(x < x[touched])
+        slopes = (y[touched] - y[left]) / (x[touched] - x[left])
+        nearest = int(np.argmin(slopes))
+        slope = float(slopes[nearest])
+        touched = int(left[nearest])
+    return float(y[touched] - slope * x[touched]), slope
 
 
 def fit_separate_bounds(stops: Stops, radius: float) -> Braking | None:

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 from skid_rover import kinematics as skid_steer_kinematics
 from skid_rover import rover
 
@@ -20,6 +21,7 @@ from nics_drl_bridge.robot.braking import (
     _find_min_fraction,
     derive_slowest_model,
     find_braking,
+    find_lowest_line,
     list_motions,
 )
 from nics_drl_bridge.robot.curve import InputCurve
@@ -343,3 +345,17 @@ def test_no_share_of_a_bound_of_zero_is_taken():
     bounded = _find_min_fraction(np.array([0.0, 0.3]), np.array([0.0, 0.5]))
     assert bounded == pytest.approx(0.6)
     assert _find_min_fraction(np.zeros(2), np.zeros(2)) == 1.0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_lowest_line_above_points_is_that_of_a_linear_program(seed):
+    rng = np.random.default_rng(seed)
+    x = np.round(rng.uniform(0.0, 2.0, 30), 1)  # some twice
+    y = rng.uniform(0.0, 1.0) + rng.uniform(-0.5, 1.0) * x + rng.uniform(0.0, 0.3, 30)
+    at = rng.uniform(0.0, 2.0)
+    above = np.stack([-np.ones(30), -x], axis=1)
+    best = linprog([1.0, at], above, -y, bounds=(0.0, None))
+    intercept, slope = find_lowest_line(x, y, at)
+    assert min(intercept, slope) >= 0.0
+    assert (intercept + slope * x >= y - 1e-12).all()
+    assert intercept + slope * at == pytest.approx(best.fun, abs=1e-9)
