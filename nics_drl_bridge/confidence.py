@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from numpy.typing import ArrayLike
-from scipy import special
 
 CONFIDENCE = 0.95
 
@@ -33,7 +33,7 @@ def estimate_rate(hits: int, trials: int) -> ConfidenceInterval:
     if trials < 1:
         return ConfidenceInterval(math.nan, 0.0, 1.0)
     share = hits / trials
-    z = float(special.ndtri(0.5 + CONFIDENCE / 2.0))
+    z = float(scipy.special.ndtri(0.5 + CONFIDENCE / 2.0))
     scale = 1.0 + z * z / trials
     middle = (share + z * z / (2.0 * trials)) / scale
     half = (
@@ -52,7 +52,7 @@ def estimate_mean(values: ArrayLike) -> ConfidenceInterval:
     middle = float(observed.mean()) if len(observed) else math.nan
     if len(observed) < 2:
         return ConfidenceInterval(middle, -math.inf, math.inf)
-    quantile = float(special.stdtrit(len(observed) - 1, 0.5 + CONFIDENCE / 2.0))
+    quantile = float(scipy.special.stdtrit(len(observed) - 1, 0.5 + CONFIDENCE / 2.0))
     half = quantile * float(observed.std(ddof=1)) / math.sqrt(len(observed))
     return ConfidenceInterval(middle, middle - half, middle + half)
 
@@ -70,7 +70,7 @@ def bound_rate(failures: int, trials: int) -> tuple[float, float]:
         return 0.0, 1.0 - math.pow(1.0 - CONFIDENCE, 1.0 / trials)
     tail = (1.0 - CONFIDENCE) / 2.0
     passed = trials - failures
-    low = float(special.betaincinv(failures, passed + 1, tail))
+    low = float(scipy.special.betaincinv(failures, passed + 1, tail))
     if passed == 0:
         return low, 1.0
-    return low, float(special.betaincinv(failures + 1, passed, 1.0 - tail))
+    return low, float(scipy.special.betaincinv(failures + 1, passed, 1.0 - tail))

@@ -1,6 +1,7 @@
 """Entry points of the nodes, and their help; without ROS 2 they print one sentence."""
 
 import faulthandler
+import gc
 import os
 import signal
 import sys
@@ -101,7 +102,10 @@ def start(node: str, args: list[str] | None = None) -> None:
     try:
         transport.set_transport(os.environ)
         own_process.begin_own_process()
+        gc.disable()  # what is imported stays, so that looking for garbage finds none
         main = _load_main(node)
+        gc.freeze()
+        gc.enable()
         main(args)
     except SystemExit as end:
         code = end.code

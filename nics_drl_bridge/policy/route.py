@@ -10,9 +10,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import Array
@@ -88,7 +87,7 @@ def _search(passable: Mask, cell_costs: Array, start: Cell, goal: Cell) -> list[
     first = int(np.ravel_multi_index(start, shape))
     last = int(np.ravel_multi_index(goal, shape))
     # Searching backwards from the goal, the predecessor of a cell is the next one to drive to.
-    costs, following = dijkstra(
+    costs, following = scipy.sparse.csgraph.dijkstra(
         _link_cells(passable, cell_costs),
         directed=False,
         indices=last,
@@ -107,7 +106,7 @@ def _link_cells(passable: Mask, cell_costs: Array) -> Any:
     links = zip(*_list_links(passable, cell_costs), strict=True)
     ends, other_ends, costs = map(np.concatenate, links)
     shape = (passable.size, passable.size)
-    return coo_array((costs, (ends, other_ends)), shape=shape).tocsr()
+    return scipy.sparse.coo_array((costs, (ends, other_ends)), shape=shape).tocsr()
 
 
 def _list_links(passable: Mask, cell_costs: Array) -> Iterator[tuple[AnyArray, ...]]:

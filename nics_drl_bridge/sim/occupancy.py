@@ -20,8 +20,8 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from nics_drl_bridge.geometry import compose, rotate
 from nics_drl_bridge.lidar.arrays import Array, Mask
@@ -169,7 +169,7 @@ def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
     edge = _along(closed_outline, made.resolution)
     index = made.world_to_cell(pose[:2] + rotate(edge, pose[2])) - low
     index = index[_is_within(index, box)]
-    near_inside = ndimage.maximum_filter(inside, 3)
+    near_inside = scipy.ndimage.maximum_filter(inside, 3)
     thin = index[~near_inside[index[:, 0], index[:, 1]]]
     box[thin[:, 0], thin[:, 1]] = OCCUPIED
 

@@ -7,9 +7,9 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from numpy.typing import ArrayLike
 from pydantic import ValidationError
-from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.kernels import pack
@@ -402,7 +402,7 @@ def _find_areas(
     """
     robot = f"a robot of radius {footprint:g} m with {world.clearance:g} m around it"
     least = world.goal_distance[0]
-    area, _ = ndimage.label(cells.distances >= room)
+    area, _ = scipy.ndimage.label(cells.distances >= room)
     if not area.any():
         raise ConfigError(
             f"{world.source}: key 'clearance': no free space for {robot}; lower `clearance`, "
@@ -446,7 +446,7 @@ def _centres(cells: MapField) -> Array:
 
 def _large_enough(area: ShortIntegers, cell: float, least: float) -> ShortIntegers:
     keep = [0]
-    for number, parts in enumerate(ndimage.find_objects(area), 1):
+    for number, parts in enumerate(scipy.ndimage.find_objects(area), 1):
         span = cell * math.hypot(*(part.stop - part.start for part in parts))
         keep.append(number if span >= least else 0)
     return np.array(keep, np.int32)[area]

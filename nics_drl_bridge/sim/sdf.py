@@ -18,8 +18,8 @@ from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from pydantic import ValidationError
-from scipy.spatial.transform import Rotation
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.arguments import check_path
@@ -570,12 +570,15 @@ def _matrix(pose: Element | None, where: Where) -> Array:
             raise where.error(f": attribute {name}={value!r} of a <pose>; {hint}")
     numbers = _floats(pose.text or "", NUMBERS[form], where.at(": <pose>"))
     matrix[:3, 3] = numbers[:3]
+    rotation = scipy.spatial.transform.Rotation
     if form == "quat_xyzw":
         if not any(numbers[3:]):
             raise where.error(": the quaternion of a <pose> is 0; give a rotation.")
-        matrix[:3, :3] = Rotation.from_quat(numbers[3:]).as_matrix()
+        turned = rotation.from_quat(numbers[3:])
+        matrix[:3, :3] = turned.as_matrix()
     elif any(numbers[3:]):
-        turned = Rotation.from_euler("xyz", numbers[3:], degrees in ("true", "1"))
+        in_degrees = degrees in ("true", "1")
+        turned = rotation.from_euler("xyz", numbers[3:], in_degrees)
         matrix[:3, :3] = turned.as_matrix()
     return matrix
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from pydantic import Field, model_validator
-from scipy import ndimage
 
 from nics_drl_bridge.arguments import format_value
 from nics_drl_bridge.config import Schema, parse_yaml, read_text, share_folder, validate
@@ -290,8 +290,8 @@ def _has_way(filled: Mask, parameters: Cellular) -> bool:
     )
     free[:, [0, -1]] = False  # the walls on both sides
     free[ahead:-ahead, 1:-1] = ~np.repeat(np.repeat(filled, FINE, axis=0), FINE, axis=1)
-    away = ndimage.distance_transform_edt(free) * parameters.cell / FINE
-    areas, _ = ndimage.label(away > parameters.passage / 2.0)
+    away = scipy.ndimage.distance_transform_edt(free) * parameters.cell / FINE
+    areas, _ = scipy.ndimage.label(away > parameters.passage / 2.0)
     start, goal = areas[[0, -1], areas.shape[1] // 2].tolist()
     return bool(start > 0 and start == goal)
 
