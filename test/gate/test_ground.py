@@ -14,6 +14,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.gate.evidence import find_obstacles, make_static
 from nics_drl_bridge.gate.footprint import get_body
 from nics_drl_bridge.gate.ground import REMEMBERED_S, update_ground
+from nics_drl_bridge.gate.ground_kernels import Grid, find_unseen, shift_cells
 from nics_drl_bridge.gate.shield import STEP
 from nics_drl_bridge.gate.shield_kernels import Stop, is_free
 from nics_drl_bridge.gate.state import ShieldConfig, View
@@ -218,3 +219,30 @@ def test_what_was_known_is_forgotten_when_the_gate_is_armed_and_when_odometry_le
         rig.run(0.1)
     assert rig.state.ground.since_ns == rig.state.views[-1].stamp_ns
     assert len(rig.state.views) == 1
+
+
+def test_the_border_is_what_is_unknown_and_next_to_what_is_known_or_in_view():
+    rng = np.random.default_rng(0)
+    heading = 0.7
+    grid = Grid(-0.5, -0.4, 0.1, np.cos(heading), np.sin(heading))
+    for _ in range(20):
+        times = np.where(rng.random((9, 9)) < 0.5, 1.0, -np.inf).astype(np.float32)
+        in_view = rng.random((9, 9)) < 0.2
+        known = in_view | np.isfinite(times)
+        inner = np.pad(np.ones((7, 7), np.bool_), 1)
+        edges = np.pad(known, 1, mode="edge")
+        beside = edges[:-2, 1:-1] | edges[2:, 1:-1] | edges[1:-1, :-2] | edges[1:-1, 2:]
+        rows, columns = np.nonzero(~in_view & ~(inner & known) & beside)
+        middles = np.stack([-0.5 + 0.1 * columns, -0.4 + 0.1 * rows], axis=1) + 0.05
+        expected = geometry.rotate(middles, -heading)
+        assert find_unseen(times, in_view, grid) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("moved", [(0, 0), (2, -1), (-3, 1), (1, 4), (5, 0)])
+def test_cells_that_are_shifted_stay_where_they_are_and_new_ones_are_unknown(moved):
+    times = np.arange(25, dtype=np.float32).reshape(5, 5)
+    shifted = shift_cells(times, *moved)
+    for (i, j), time in np.ndenumerate(shifted):
+        row, column = i + moved[1], j + moved[0]
+        stays = 0 <= row < 5 and 0 <= column < 5
+        assert time == (times[row, column] if stays else -np.inf)
