@@ -13,6 +13,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.black_box import (
     FORMAT,
     Entry,
+    from_plain,
     replay,
     write,
 )
@@ -191,3 +192,9 @@ def test_a_huge_file_is_refused_at_once(tmp_path):
         file.truncate(2**33)
     with pytest.raises(ConfigError, match="is larger than 64 MB"):
         replay(path)
+
+
+@pytest.mark.parametrize("name", ["dataclass", "array"])
+def test_a_record_names_a_kind_of_record_and_nothing_else_of_its_modules(name):
+    with pytest.raises(ValueError, match="can't be read"):
+        from_plain({"kind": name})

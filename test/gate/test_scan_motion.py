@@ -7,8 +7,10 @@ import pytest
 
 from gate.recorded import WALLS, see
 from gate.rig import PERIOD_S, TICK_S, Rig, config
+from nics_drl_bridge.gate import scan_motion
 from nics_drl_bridge.gate.inputs import Scan
-from nics_drl_bridge.gate.scan_motion import warm_up
+from nics_drl_bridge.gate.scan_motion import SETTINGS, judge_motion, warm_up
+from nics_drl_bridge.gate.state import View
 from nics_drl_bridge.geometry import compose, exp
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
@@ -270,3 +272,65 @@ def test_scans_from_before_the_stamps_jumped_back_are_not_compared():
     stamps = [view.stamp_ns for view in scene.state.scan_motion.views]
     assert len(stamps) > 2
     assert max(stamps) <= scene.stamp
+
+
+def views_along(*steps, period_s=0.1):
+    """Views of a robot that drives such steps [m] straight ahead, one after the other."""
+    return tuple(
+        View(round(k * period_s * NS_PER_S), np.array([x, 0.0, 0.0]), np.ones(3))
+        for k, x in enumerate(np.cumsum([0.0, *steps]))
+    )
+
+
+def look(monkeypatch, observed, changed, steps=(0.25, 0.25)):
+    """Judges the last of some views, whose sectors show fractions of the motion."""
+    shown = np.array(observed, float), np.array(changed, float)
+    monkeypatch.setattr(scan_motion, "_compare_scans", lambda *_: shown)
+    *kept, newest = views_along(*steps)
+    return judge_motion(config(), tuple(kept), newest)
+
+
+SHOWN = SETTINGS.sector_share  # what a sector that agrees shows at least
+
+
+@pytest.mark.parametrize(
+    ("observed", "changed", "steps", "held"),
+    [
+        ([0.0] * 5, [0.0] * 5, (0.25, 0.25), True),
+        ([0.0] * 5, [0.5] * 5, (0.25, 0.25), False),  # too much has changed
+        ([0.0] * 3 + [SHOWN] * 2, [0.0] * 5, (0.25, 0.25), True),
+        ([0.0] * 5 + [SHOWN] * 5, [0.0] * 10, (0.25, 0.25), False),
+        ([-SHOWN] * 2 + [0.0] * 3, [0.0] * 5, (0.25, 0.25), True),
+        ([0.2] * 5, [0.0] * 5, (0.25, 0.25), False),
+        ([-0.2] * 5, [0.0] * 5, (0.25, 0.25), False),
+        ([0.15] * 5, [0.0] * 5, (0.25, 0.25), True),
+        ([0.17] * 5, [0.0] * 5, (0.5, 0.125), False),  # the limits shrink by 0.8
+        ([0.17] * 5, [0.0] * 5, (0.125, 0.5), False),
+        ([0.17] * 5, [0.0] * 5, (0.375, 0.125), True),  # at the usual fraction
+        ([0.0] * 5, [0.0] * 5, (0.02, 0.02), True),  # the least motion
+        ([0.0] * 5, [0.0] * 5, (0.02, 0.09), True),  # the least in one half
+    ],
+)
+def test_a_body_is_held_if_most_sectors_show_too_little_of_the_motion(
+    monkeypatch, observed, changed, steps, held
+):
+    verdict = look(monkeypatch, observed, changed, steps)
+    assert verdict.held == held
+    assert verdict.share == np.median(observed)
+    assert verdict.reference.stamp_ns == 0
+
+
+@pytest.mark.parametrize(
+    ("observed", "steps"),
+    [
+        ([0.0] * 4 + [np.nan] * 5, (0.25, 0.25)),  # too few sectors
+        ([0.0] * 5, (0.019, 0.02)),  # too little motion
+        ([0.0] * 5, (0.01, 0.09)),  # in one half
+        ([0.0] * 5, (1.0, 0.1)),
+        ([0.0] * 5, (0.25,)),  # no scan between
+    ],
+)
+def test_too_little_evidence_decides_nothing(monkeypatch, observed, steps):
+    verdict = look(monkeypatch, observed, np.zeros(len(observed)), steps)
+    assert np.isnan(verdict.share)
+    assert not verdict.held

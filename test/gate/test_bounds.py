@@ -1,0 +1,135 @@
+"""A check or a rule accepts the value at its bound, and nothing beyond it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gate.rig import config
+from nics_drl_bridge.gate.arming import CHECKS
+from nics_drl_bridge.gate.inputs import Arm, Command, Estimate, Odometry, Tick
+from nics_drl_bridge.gate.state import Arrivals, EStopState, SensorState, begin
+from nics_drl_bridge.gate.stops import STOPS, take_time
+
+NOW = 100.0
+# Times here are exact in binary.
+AGE_S = 0.25
+OLDER_S = 0.28125
+AGES = ("scan_age_s", "odom_age_s", "command_age_s", "estimate_silence_s")
+CONFIG = config(
+    **dict.fromkeys((*AGES, "e_stop_silence_s", "race_s", "gap_s"), AGE_S),
+    settle_s=1.0,
+    clock_jump_s=0.5,
+    scan_rate=8.0,
+    odom_rate=8.0,
+    rate_tolerance=0.25,
+    sensors=("rear",),
+)
+RULES = {rule.name: rule for rule in STOPS}
+COMMAND = Command(0, np.zeros(3))
+STANDING = Odometry(0, np.zeros(3), np.zeros(3))
+SURE = Estimate(np.zeros(3), np.zeros(3), np.zeros((3, 3)))
+
+
+def arrived(age_s=0.0, late_s=0.0, rate=8, unbroken_s=0.0, ahead_s=0.0):
+    """Arrivals of a rate over the settling time, the newest of which has an age."""
+    return Arrivals(
+        stamps_ns=(round((1.0 + ahead_s) * 1e9),),
+        times=(NOW - age_s,),
+        late=(late_s,),
+        count=1 + rate,
+        unbroken_s=unbroken_s,
+        marks=((NOW - 1.0, 0, 1, 0.0),),
+    )
+
+
+def judge(name, changes):
+    """Returns what a check or a rule finds in a state."""
+    state = replace(begin(CONFIG), **changes)
+    if name in CHECKS:
+        return CHECKS[name](CONFIG, state, Arm(1), NOW)
+    return RULES[name].judge(CONFIG, state, NOW)
+
+
+CASES = [
+    ("standing_still", lambda s: {"odometry": STANDING, "restless_s": s}, 99.0, 99.5),
+    ("scan_fresh", lambda age: {"scans": arrived(age)}, AGE_S, OLDER_S),
+    ("scan_fresh", lambda s: {"scans": arrived(unbroken_s=s)}, 99.0, 99.5),
+    ("odom_fresh", lambda age: {"odometries": arrived(age)}, AGE_S, OLDER_S),
+    ("scan_rate", lambda rate: {"scans": arrived(rate=rate)}, 6, 5),
+    ("odom_rate", lambda rate: {"odometries": arrived(rate=rate)}, 10, 11),
+    (
+        "clocks_agree",
+        lambda s: {"scans": arrived(ahead_s=s), "odometries": arrived()},
+        0.5,
+        0.5625,
+    ),
+    (
+        "estimator_converged",
+        lambda age: {"estimate": SURE, "estimate_s": NOW - age},
+        AGE_S,
+        OLDER_S,
+    ),
+    ("one_policy", lambda s: {"last_mixed": "two", "mixed_s": s}, 99.0, 99.5),
+    ("scan_silent", lambda late_s: {"scans": arrived(0.125, late_s)}, 0.125, 0.15625),
+    ("odom_silent", lambda age: {"odometries": arrived(age)}, AGE_S, OLDER_S),
+    (
+        "sensor_silent",
+        lambda age: {"sensors": (SensorState(arrived(age)),)},
+        AGE_S,
+        OLDER_S,
+    ),
+    (
+        "command_silent",
+        lambda age: {"command": COMMAND, "command_s": NOW - age},
+        AGE_S,
+        OLDER_S,
+    ),
+    (
+        "scan_behind_old",
+        lambda age: {"command": COMMAND, "behind_s": NOW - age},
+        AGE_S,
+        OLDER_S,
+    ),
+    (
+        "scan_behind_unknown",
+        lambda age: {"command": COMMAND, "pending": COMMAND, "pending_s": NOW - age},
+        AGE_S,
+        OLDER_S,
+    ),
+    (
+        "e_stop_silent",
+        lambda age: {"e_stop": EStopState(heard_s=NOW - age)},
+        AGE_S,
+        OLDER_S,
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "make", "bound", "beyond"), CASES)
+def test_a_value_at_its_bound_is_accepted_and_one_beyond_it_is_not(
+    name, make, bound, beyond
+):
+    assert not judge(name, make(bound))
+    assert judge(name, make(beyond))
+
+
+@pytest.mark.parametrize(
+    ("tick_s", "awake_s", "is_fault"),
+    [
+        (NOW - AGE_S, 0.0, False),
+        (NOW - OLDER_S, 0.0, True),
+        (NOW - AGE_S, NOW - AGE_S, True),  # awake again for too short a time
+        (NOW - AGE_S, NOW - OLDER_S, False),
+    ],
+)
+def test_a_gate_that_slept_for_too_long_is_at_fault_until_it_was_awake_as_long(
+    tick_s, awake_s, is_fault
+):
+    state = replace(begin(CONFIG), tick_s=tick_s, awake_s=awake_s, now_s=NOW - AGE_S)
+    for event in (Tick(), COMMAND):
+        after = take_time(CONFIG, state, event, NOW)
+        assert bool(after.clock_fault) == is_fault
+        assert after.tick_s == (NOW if event == Tick() else tick_s)
