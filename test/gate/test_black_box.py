@@ -10,6 +10,7 @@ import pytest
 
 from gate.rig import TICK_S, Rig, config
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.gate import black_box
 from nics_drl_bridge.gate.black_box import (
     FORMAT,
     Entry,
@@ -163,7 +164,7 @@ def huge(**changes):
         {"given": None},
         {"now": "x"},
         {"now": None},
-        {"now": 1e308},
+        {"now": 1e12},
         {"decision": {"kind": "EStop", "pressed": True}},
         {"decision": []},
         None,
@@ -191,6 +192,19 @@ def test_a_huge_file_is_refused_at_once(tmp_path):
     with path.open("wb") as file:
         file.truncate(2**33)
     with pytest.raises(ConfigError, match="is larger than 64 MB"):
+        replay(path)
+
+
+@pytest.mark.parametrize("bound", ["MOST_INPUTS", "MOST_VALUES"])
+def test_a_file_of_as_much_as_may_be_replayed_is_replayed(tmp_path, monkeypatch, bound):
+    path = tmp_path / "stop.jsonl"
+    count = len(stopped(path).entries)
+    if bound == "MOST_VALUES":
+        count = sum(path.read_text().count(mark) for mark in ",[{")
+    monkeypatch.setattr(black_box, bound, count)
+    assert replay(path).differing == ()
+    monkeypatch.setattr(black_box, bound, count - 1)
+    with pytest.raises(ConfigError, match="at most"):
         replay(path)
 
 

@@ -9,9 +9,19 @@ import pytest
 
 from gate.rig import config
 from nics_drl_bridge.gate.arming import CHECKS
+from nics_drl_bridge.gate.estimate import track_estimate
 from nics_drl_bridge.gate.inputs import Arm, Command, Estimate, Odometry, Tick
-from nics_drl_bridge.gate.state import Arrivals, EStopState, SensorState, begin
-from nics_drl_bridge.gate.stops import STOPS, take_time
+from nics_drl_bridge.gate.intake import check_odometry
+from nics_drl_bridge.gate.state import (
+    Arrivals,
+    EstimateMark,
+    EstimateTrack,
+    EStopState,
+    Push,
+    SensorState,
+    begin,
+)
+from nics_drl_bridge.gate.stops import SOURCE_S, STOPS, take_time, watch_source
 
 NOW = 100.0
 # Times here are exact in binary.
@@ -22,6 +32,8 @@ CONFIG = config(
     **dict.fromkeys((*AGES, "e_stop_silence_s", "race_s", "gap_s"), AGE_S),
     settle_s=1.0,
     clock_jump_s=0.5,
+    estimate_position=0.5,
+    estimate_heading=0.25,
     scan_rate=8.0,
     odom_rate=8.0,
     rate_tolerance=0.25,
@@ -43,6 +55,16 @@ def arrived(age_s=0.0, late_s=0.0, rate=8, unbroken_s=0.0, ahead_s=0.0):
         unbroken_s=unbroken_s,
         marks=((NOW - 1.0, 0, 1, 0.0),),
     )
+
+
+def at(x):
+    return Odometry(0, np.array([x, 0.0, 0.0]), np.zeros(3))
+
+
+def pushed(since_s, path):
+    """A motion commanded since a time, over a path [m] from the origin."""
+    commanded = np.array([path, 0.0, 0.0])
+    return Push(since_s, NOW, NOW, commanded, ((since_s, np.zeros(3), np.zeros(3)),))
 
 
 def judge(name, changes):
@@ -105,6 +127,14 @@ CASES = [
         AGE_S,
         OLDER_S,
     ),
+    ("no_motion", lambda s: {"odometry": STANDING, "push": pushed(s, 1.0)}, 99.0, 98.5),
+    ("no_motion", lambda x: {"odometry": at(x), "push": pushed(98.0, 1.0)}, 0.1, 0.09),
+    (
+        "no_motion",
+        lambda path: {"odometry": STANDING, "push": pushed(98.0, path)},
+        0.0299,
+        0.03,
+    ),
 ]
 
 
@@ -133,3 +163,40 @@ def test_a_gate_that_slept_for_too_long_is_at_fault_until_it_was_awake_as_long(
         after = take_time(CONFIG, state, event, NOW)
         assert bool(after.clock_fault) == is_fault
         assert after.tick_s == (NOW if event == Tick() else tick_s)
+
+
+@pytest.mark.parametrize(
+    ("variances", "x", "is_fault"),
+    [
+        ((0.25, 0.0, 0.0625), 0.0, False),
+        ((0.2501, 0.0, 0.0), 0.0, True),
+        ((0.0, 0.0, 0.0626), 0.0, True),
+        ((0.0, 0.0, 0.0), 1.0, False),  # 0.5 m, and 0.5 m at twice the maximum speed
+        ((0.0, 0.0, 0.0), 1.001, True),
+    ],
+)
+def test_an_estimate_may_gain_and_jump_by_its_limits_and_no_more(
+    variances, x, is_fault
+):
+    track = EstimateTrack((EstimateMark(NOW - 10.0, np.zeros(3), np.zeros((3, 3))),))
+    state = replace(
+        begin(CONFIG), estimate=SURE, estimate_s=NOW - AGE_S, estimates=track
+    )
+    after = Estimate(np.zeros(3), np.array([x, 0.0, 0.0]), np.diag(variances))
+    assert bool(track_estimate(CONFIG, state, after, NOW).fault) == is_fault
+    assert not track_estimate(CONFIG, state, after, NOW + 1.0).fault  # it is too old
+
+
+def test_a_command_of_another_publisher_is_accepted_once_the_first_was_silent():
+    for silent_s, mixed in ((SOURCE_S, False), (0.5, True)):
+        state = replace(begin(CONFIG), source="one", source_s=NOW - silent_s)
+        command = replace(COMMAND, source="another")
+        assert bool(watch_source(state, command, NOW).mixed) == mixed
+
+
+def test_odometry_may_be_as_fast_as_a_mobile_robot_can_be():
+    for speed, refused in ((100.0, False), (-100.01, True)):
+        assert (
+            bool(check_odometry(CONFIG, replace(STANDING, twist=np.full(3, speed))))
+            == refused
+        )

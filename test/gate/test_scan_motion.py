@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from gate.recorded import WALLS, see
 from gate.rig import PERIOD_S, TICK_S, Rig, config
 from nics_drl_bridge.gate import scan_motion
 from nics_drl_bridge.gate.inputs import Scan
-from nics_drl_bridge.gate.scan_motion import SETTINGS, judge_motion, warm_up
+from nics_drl_bridge.gate.scan_motion import SETTINGS, Verdict, judge_motion, warm_up
 from nics_drl_bridge.gate.state import View
 from nics_drl_bridge.geometry import compose, exp
 from nics_drl_bridge.interface import NS_PER_S
@@ -334,3 +336,43 @@ def test_too_little_evidence_decides_nothing(monkeypatch, observed, steps):
     verdict = look(monkeypatch, observed, np.zeros(len(observed)), steps)
     assert np.isnan(verdict.share)
     assert not verdict.held
+
+
+@pytest.mark.parametrize(
+    ("turn", "chosen"),
+    [(0.0, 0), (0.6, 0), (0.61, 1), (0.71, 2), (1.4, 2), (1.41, 1), (1.51, None)],
+)
+def test_a_scan_is_compared_with_the_oldest_since_which_the_robot_turned_a_little(
+    monkeypatch, turn, chosen
+):
+    """Not if it turned too far, because a room may repeat itself."""
+    compared = np.zeros(9), np.zeros(9)
+    monkeypatch.setattr(scan_motion, "_compare_scans", lambda *_: compared)
+    views = views_along(0.5, 0.5, 0.5, 0.5)
+    turns = (0.0, 0.1, 0.0, 0.3, turn)
+    *kept, newest = (
+        replace(view, pose=np.array([*view.pose[:2], angle]))
+        for view, angle in zip(views, turns, strict=True)
+    )
+    reference = judge_motion(config(), tuple(kept), newest).reference
+    assert reference == (None if chosen is None else kept[chosen])
+
+
+@pytest.mark.parametrize(
+    ("share", "held", "before_s", "since_s"),
+    [
+        (0.1, True, None, 9.0),
+        (0.1, True, 8.0, 8.0),
+        (0.1, True, 7.9, 9.0),  # forgotten
+        (np.nan, False, 8.0, 8.0),
+        (np.nan, False, 7.9, None),
+        (1.0, False, 8.5, None),
+    ],
+)
+def test_a_contradiction_lasts_until_a_scan_agrees_or_it_is_forgotten(
+    share, held, before_s, since_s
+):
+    before_ns = None if before_s is None else round(before_s * NS_PER_S)
+    since_ns = None if since_s is None else round(since_s * NS_PER_S)
+    verdict = Verdict(share, held)
+    assert scan_motion._update_held_since(before_ns, verdict, 9 * NS_PER_S) == since_ns

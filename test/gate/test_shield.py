@@ -328,7 +328,8 @@ def test_the_first_and_the_last_beam_are_neighbours_only_in_a_full_circle(
     old = np.full(count, 2.0, np.float32)
     new = old.copy()
     new[[0, -1]] = 1.0
-    views = (View(0, np.zeros(3), old), View(NS_PER_S // 10, np.zeros(3), new))
+    turned = np.array([0.0, 0.0, 8 * LIDAR.angle_increment])  # away from the gap
+    views = (View(0, np.zeros(3), old), View(NS_PER_S // 10, turned, new))
     entered = np.flatnonzero(find_movers(given, SHIELD, views))
     assert entered.tolist() == ([0, count - 1] if moves else [])
 
