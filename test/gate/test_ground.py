@@ -14,7 +14,13 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.gate.evidence import find_obstacles, make_static
 from nics_drl_bridge.gate.footprint import get_body
 from nics_drl_bridge.gate.ground import REMEMBERED_S, update_ground
-from nics_drl_bridge.gate.ground_kernels import Grid, find_unseen, shift_cells
+from nics_drl_bridge.gate.ground_kernels import (
+    Grid,
+    find_unseen,
+    forget_old,
+    mark_covered,
+    shift_cells,
+)
 from nics_drl_bridge.gate.shield import STEP
 from nics_drl_bridge.gate.shield_kernels import Stop, is_free
 from nics_drl_bridge.gate.state import ShieldConfig, View
@@ -246,3 +252,28 @@ def test_cells_that_are_shifted_stay_where_they_are_and_new_ones_are_unknown(mov
         row, column = i + moved[1], j + moved[0]
         stays = 0 <= row < 5 and 0 <= column < 5
         assert time == (times[row, column] if stays else -np.inf)
+
+
+@pytest.mark.parametrize("corners", [OUTLINE, ()])
+def test_only_the_cells_under_the_footprint_are_covered(corners):
+    heading = 0.4
+    grid = Grid(-0.5, -0.52, 0.05, np.cos(heading), np.sin(heading))
+    shape = (
+        shapely.Polygon(corners) if corners else shapely.Point(0, 0).buffer(0.33, 64)
+    )
+    body = get_body(replace(SHIELD, outline=corners, footprint_radius=0.33))
+    times = np.full((20, 20), -np.inf, np.float32)
+    mark_covered(times, grid, body, 3.0)
+    rows, columns = np.indices(times.shape)
+    middles = np.stack([columns * 0.05 - 0.475, rows * 0.05 - 0.495], axis=-1)
+    points = shapely.points(geometry.rotate(middles, -heading))
+    assert np.array_equal(times == 3.0, shapely.contains(shape, points))
+
+
+def test_cells_are_forgotten_once_they_are_too_old_and_those_beside_the_robot_are_new():
+    times = np.array([[5.0, 6.0, 4.9, -np.inf]], np.float32)
+    grid = Grid(-0.125, -0.125, 0.25, 1.0, 0.0)  # the first is under the robot
+    forget_old(times, grid, 0.25, now=9.0, oldest=5.0)
+    assert times.tolist() == [[9.0, 9.0, -np.inf, -np.inf]]
+    forget_old(times, grid, 0.0, now=9.5, oldest=9.0)
+    assert times.tolist() == [[9.5, 9.0, -np.inf, -np.inf]]
