@@ -19,7 +19,6 @@ from nics_drl_bridge.gate.ground_kernels import (
     find_unseen,
     forget_old,
     mark_covered,
-    shift_cells,
 )
 from nics_drl_bridge.gate.shield import STEP
 from nics_drl_bridge.gate.shield_kernels import Stop, is_free
@@ -242,16 +241,6 @@ def test_the_border_is_what_is_unknown_and_next_to_what_is_known_or_in_view():
         middles = np.stack([-0.5 + 0.1 * columns, -0.4 + 0.1 * rows], axis=1) + 0.05
         expected = geometry.rotate(middles, -heading)
         assert find_unseen(times, in_view, grid) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize("moved", [(0, 0), (2, -1), (-3, 1), (1, 4), (5, 0)])
-def test_cells_that_are_shifted_stay_where_they_are_and_new_ones_are_unknown(moved):
-    times = np.arange(25, dtype=np.float32).reshape(5, 5)
-    shifted = shift_cells(times, *moved)
-    for (i, j), time in np.ndenumerate(shifted):
-        row, column = i + moved[1], j + moved[0]
-        stays = 0 <= row < 5 and 0 <= column < 5
-        assert time == (times[row, column] if stays else -np.inf)
 
 
 @pytest.mark.parametrize("corners", [OUTLINE, ()])

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import re
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from nics_drl_bridge.gate.assurance.adversaries import HORIZONS_S, Adversary, Tr
 from nics_drl_bridge.generator import builtin_model
 
 MODEL = builtin_model("mecanum")  # it goes anywhere at once
-ROBOT = MODEL.robot
 AWAY = 2.0
 
 
@@ -54,12 +52,3 @@ def test_one_that_is_late_keeps_away_and_turns_in_for_three_steps_each_time():
     steps = "".join("a" if approach(each, 0.0) < 0.0 else "t" for each in commands)
     assert re.fullmatch("(a{0,12}ttt)*a{0,12}t{0,2}", steps), steps
     assert "attta" in steps
-
-
-def test_one_that_jerks_holds_each_end_of_its_commands_for_a_while():
-    commands = drive("jerk", see(0.0, is_wall=True))
-    assert all(
-        np.isin(c, [ROBOT.command_low, ROBOT.command_high]).all() for c in commands
-    )
-    changes = sum((a != b).any() for a, b in pairwise(commands))
-    assert 10 < changes < 50
