@@ -8,6 +8,7 @@ import pytest
 from gate.recorded import see
 from gate.rig import LIDAR, Rig, config
 from nics_drl_bridge import geometry
+from nics_drl_bridge.gate import evidence
 from nics_drl_bridge.gate.evidence import (
     add_view,
     estimate_motion,
@@ -349,3 +350,13 @@ def test_scans_correct_a_turn_that_is_worth_it_if_half_the_directions_show_anoth
     new = View(NS_PER_S // 10, np.array([0.0, 0.0, turn]), ranges)
     motion = estimate_motion(old, new, get_beams(GIVEN), Tolerance(0.03, 0.0))
     assert motion == pytest.approx([0.0, 0.0, expected], abs=5e-3)
+
+
+@pytest.mark.parametrize("turn", [0.05, -2.0])
+def test_the_turns_and_the_motions_that_are_tried_are_close_to_each_other(turn):
+    turns = evidence._vary_turn(np.array([0.0, 0.0, turn]))[:, 2] / turn
+    assert (np.diff(np.abs(turns - 1.0)) > -1e-9).all()  # odometry's comes first
+    assert np.diff(np.sort(turns)).max() * abs(turn) < 0.03
+    assert (turns.min(), turns.max()) == pytest.approx((0.0, 1.3))
+    lesser = evidence._lessen_motion(np.array([0.49, 0.0, 0.0]))[:, 0]
+    assert lesser == pytest.approx(0.049 * np.arange(10))
