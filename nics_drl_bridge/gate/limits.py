@@ -200,8 +200,8 @@ def saturate(command: Array, limits: Limits) -> Array:
         bound = limits.low[i] if np.signbit(value) else limits.high[i]
         if bound == 0.0:
             out[i] = 0.0
-        elif speeds[i] and abs(value) > abs(bound):
-            factor = min(factor, bound / value)
+        elif speeds[i]:
+            factor = min(factor, abs(bound) / max(abs(value), abs(bound)))
     out[speeds] *= factor
     return flush_denormals(np.clip(out, limits.low, limits.high))
 
