@@ -10,8 +10,8 @@ import pytest
 from gate.rig import config
 from nics_drl_bridge.gate.arming import CHECKS
 from nics_drl_bridge.gate.estimate import track_estimate
-from nics_drl_bridge.gate.inputs import Arm, Command, Estimate, Odometry, Tick
-from nics_drl_bridge.gate.intake import check_odometry
+from nics_drl_bridge.gate.inputs import Arm, Command, Estimate, Odometry, Scan, Tick
+from nics_drl_bridge.gate.intake import check_odometry, scan_malformed
 from nics_drl_bridge.gate.state import (
     Arrivals,
     EstimateMark,
@@ -176,3 +176,10 @@ def test_odometry_may_be_as_fast_as_a_mobile_robot_can_be():
             bool(check_odometry(CONFIG, replace(STANDING, twist=np.full(3, speed))))
             == refused
         )
+
+
+@pytest.mark.parametrize(("off", "refused"), [(1e-3, False), (-1.1e-3, True)])
+def test_the_beams_may_be_off_by_the_tolerance_of_their_angles(off, refused):
+    given = config(beam_angles=np.array([0.0, 0.5]))
+    scan = Scan(0, np.ones(2, np.float32), (off, 0.5))
+    assert bool(scan_malformed(given, scan)) == refused
