@@ -119,7 +119,7 @@ def find_movers(
         )
     before = np.roll(entered, 1)
     after = np.roll(entered, -1)
-    is_full_circle = (len(entered) + 0.5) * abs(lidar.step) > FULL_CIRCLE
+    is_full_circle = len(entered) >= round(FULL_CIRCLE / abs(lidar.step))
     if not is_full_circle:
         before[0] = False
         after[-1] = False

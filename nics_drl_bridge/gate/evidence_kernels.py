@@ -78,7 +78,7 @@ def mark_entered(
         for i in range(middle - neighbours, middle + neighbours + 1):
             index = i % whole_circle
             old_range = old_ranges[index] if index < beams else np.nan
-            free_range = take_shorter(free_range, old_range)
+            free_range = np.minimum(free_range, old_range)  # NaN if either is
         if (
             distance
             < free_range - tolerance.constant - tolerance.proportional * distance
@@ -157,11 +157,3 @@ def find_beam(x: float, y: float, lidar: MountedBeams) -> int:
     angle = math.atan2(y - lidar.y, x - lidar.x)
     bearing = (angle - lidar.heading - lidar.first) / lidar.step
     return math.floor(bearing - circle * math.floor((bearing + 0.5) / circle) + 0.5)
-
-
-@kernel
-def take_shorter(first: float, second: float) -> float:
-    """Returns the shorter of two ranges; NaN as soon as either of them is unknown."""
-    if math.isnan(first) or second >= first:
-        return first
-    return second

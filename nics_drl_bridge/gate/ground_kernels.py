@@ -11,11 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.gate.evidence_kernels import (
-    MountedBeams,
-    find_beam,
-    take_shorter,
-)
+from nics_drl_bridge.gate.evidence_kernels import MountedBeams, find_beam
 from nics_drl_bridge.gate.shield_kernels import Body, compute_clearance
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.kernels import kernel
@@ -96,7 +92,7 @@ def mark_seen(
             is_seen[i, j] = True
             free = range_max
             for b in range(first, last + 1):
-                free = take_shorter(free, ranges[b])
+                free = np.minimum(free, ranges[b])  # NaN if either is
             if free > distance + tolerance:
                 times[i, j] = now
     _clear_returns(times, grid, ranges, lidar)
@@ -169,9 +165,9 @@ def find_unseen(times: Ranges, is_seen: Flags, grid: Grid) -> Array:
 @kernel
 def _has_known_neighbour(i: int, j: int, times: Ranges, is_seen: Flags) -> bool:
     """True if one of the four neighbours of a cell is free or visible."""
-    for di, dj in ((0, -1), (0, 1), (-1, 0), (1, 0)):
-        row = min(max(i + di, 0), times.shape[0] - 1)
-        column = min(max(j + dj, 0), times.shape[1] - 1)
+    for row, column in ((i, j - 1), (i, j + 1), (i - 1, j), (i + 1, j)):
+        row = min(max(row, 0), times.shape[0] - 1)
+        column = min(max(column, 0), times.shape[1] - 1)
         if is_seen[row, column] or times[row, column] > -np.inf:
             return True
     return False

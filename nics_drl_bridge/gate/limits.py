@@ -197,11 +197,11 @@ def saturate(command: Array, limits: Limits) -> Array:
     factor = 1.0
     out = flush_denormals(np.clip(command, -HUGE, HUGE))  # 0 times inf is NaN
     for i, value in enumerate(out):
-        bound = limits.high[i] if value > 0.0 else limits.low[i]
+        bound = limits.low[i] if np.signbit(value) else limits.high[i]
         if bound == 0.0:
             out[i] = 0.0
-        elif speeds[i] and abs(value) > abs(bound):
-            factor = min(factor, bound / value)
+        elif speeds[i]:
+            factor = min(factor, abs(bound) / max(abs(value), abs(bound)))
     out[speeds] *= factor
     return flush_denormals(np.clip(out, limits.low, limits.high))
 

@@ -10,9 +10,11 @@ import pytest
 
 from gate.rig import TICK_S, Rig, config
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.gate import black_box
 from nics_drl_bridge.gate.black_box import (
     FORMAT,
     Entry,
+    from_plain,
     replay,
     write,
 )
@@ -162,7 +164,7 @@ def huge(**changes):
         {"given": None},
         {"now": "x"},
         {"now": None},
-        {"now": 1e308},
+        {"now": 1e12},
         {"decision": {"kind": "EStop", "pressed": True}},
         {"decision": []},
         None,
@@ -191,3 +193,22 @@ def test_a_huge_file_is_refused_at_once(tmp_path):
         file.truncate(2**33)
     with pytest.raises(ConfigError, match="is larger than 64 MB"):
         replay(path)
+
+
+@pytest.mark.parametrize("bound", ["MOST_INPUTS", "MOST_VALUES"])
+def test_a_file_of_as_much_as_may_be_replayed_is_replayed(tmp_path, monkeypatch, bound):
+    path = tmp_path / "stop.jsonl"
+    count = len(stopped(path).entries)
+    if bound == "MOST_VALUES":
+        count = sum(path.read_text().count(mark) for mark in ",[{")
+    monkeypatch.setattr(black_box, bound, count)
+    assert replay(path).differing == ()
+    monkeypatch.setattr(black_box, bound, count - 1)
+    with pytest.raises(ConfigError, match="at most"):
+        replay(path)
+
+
+@pytest.mark.parametrize("name", ["dataclass", "array"])
+def test_a_record_names_a_kind_of_record_and_nothing_else_of_its_modules(name):
+    with pytest.raises(ValueError, match="can't be read"):
+        from_plain({"kind": name})

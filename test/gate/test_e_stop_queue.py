@@ -23,6 +23,7 @@ def test_a_sleep_in_which_not_all_messages_fit_counts_as_a_press(rate):
     fits = min(QUEUE_MESSAGES / rate, LONGEST_SLEEP_S)
     assert heard_at(rate).tick(0.9 * fits) == ""
     assert "the gate slept for" in heard_at(rate).tick(1.1 * fits)
+    assert heard_at(5.0).tick(LONGEST_SLEEP_S) == ""
 
 
 def test_more_messages_at_once_than_surely_fit_count_as_a_press():
@@ -30,7 +31,7 @@ def test_more_messages_at_once_than_surely_fit_count_as_a_press():
     queue = heard_at(100.0)
     queue.add(0.4, 250)
     assert "250 messages came at once" in queue.tick(0.4)
-    queue.add(0.42, 20)
+    queue.add(0.42, QUEUE_MESSAGES)
     assert queue.tick(0.42) == ""
 
 

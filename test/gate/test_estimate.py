@@ -17,10 +17,7 @@ from nics_drl_bridge.middleware.measurement import Kind, Measurement
     ("std", "fine"),
     [
         ((0.45, 0.0, 0.0), True),
-        ((0.0, 0.45, 0.0), True),
-        ((0.0, 0.0, 0.27), True),
         ((0.55, 0.0, 0.0), False),
-        ((0.0, 0.55, 0.0), False),
         ((0.0, 0.0, 0.33), False),
     ],
 )

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from gate.rig import LIDAR, TICK_S, Rig, config, driving
-from nics_drl_bridge.gate.frozen import is_at_rest, watch_pictures
-from nics_drl_bridge.gate.inputs import Reset
-from nics_drl_bridge.gate.state import Sameness
+from nics_drl_bridge.gate.frozen import is_at_rest, watch_motion, watch_pictures
+from nics_drl_bridge.gate.inputs import Odometry, Reset
+from nics_drl_bridge.gate.state import Sameness, begin, replace
 
 
 def room(x, size=(2.5, 1.5)):
@@ -213,3 +213,10 @@ def test_a_pose_beyond_half_a_turn_is_no_leap():
     rig.run(1.0)
     assert rig.pose[2] < 0.0
     assert rig.decision.cause is None
+
+
+def test_without_odometry_or_limits_no_motion_is_watched():
+    state = begin(config())
+    seen = replace(state, odometry=Odometry(0, np.zeros(3), np.zeros(3)))
+    assert watch_motion(config(), state, 1.0) is state
+    assert watch_motion(config(limits=None), seen, 1.0) is seen

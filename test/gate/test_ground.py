@@ -14,6 +14,12 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.gate.evidence import find_obstacles, make_static
 from nics_drl_bridge.gate.footprint import get_body
 from nics_drl_bridge.gate.ground import REMEMBERED_S, update_ground
+from nics_drl_bridge.gate.ground_kernels import (
+    Grid,
+    find_unseen,
+    forget_old,
+    mark_covered,
+)
 from nics_drl_bridge.gate.shield import STEP
 from nics_drl_bridge.gate.shield_kernels import Stop, is_free
 from nics_drl_bridge.gate.state import ShieldConfig, View
@@ -218,3 +224,45 @@ def test_what_was_known_is_forgotten_when_the_gate_is_armed_and_when_odometry_le
         rig.run(0.1)
     assert rig.state.ground.since_ns == rig.state.views[-1].stamp_ns
     assert len(rig.state.views) == 1
+
+
+def test_the_border_is_what_is_unknown_and_next_to_what_is_known_or_in_view():
+    rng = np.random.default_rng(0)
+    heading = 0.7
+    grid = Grid(-0.5, -0.4, 0.1, np.cos(heading), np.sin(heading))
+    for _ in range(20):
+        times = np.where(rng.random((9, 9)) < 0.5, 1.0, -np.inf).astype(np.float32)
+        in_view = rng.random((9, 9)) < 0.2
+        known = in_view | np.isfinite(times)
+        inner = np.pad(np.ones((7, 7), np.bool_), 1)
+        edges = np.pad(known, 1, mode="edge")
+        beside = edges[:-2, 1:-1] | edges[2:, 1:-1] | edges[1:-1, :-2] | edges[1:-1, 2:]
+        rows, columns = np.nonzero(~in_view & ~(inner & known) & beside)
+        middles = np.stack([-0.5 + 0.1 * columns, -0.4 + 0.1 * rows], axis=1) + 0.05
+        expected = geometry.rotate(middles, -heading)
+        assert find_unseen(times, in_view, grid) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("corners", [OUTLINE, ()])
+def test_only_the_cells_under_the_footprint_are_covered(corners):
+    heading = 0.4
+    grid = Grid(-0.5, -0.52, 0.05, np.cos(heading), np.sin(heading))
+    shape = (
+        shapely.Polygon(corners) if corners else shapely.Point(0, 0).buffer(0.33, 64)
+    )
+    body = get_body(replace(SHIELD, outline=corners, footprint_radius=0.33))
+    times = np.full((20, 20), -np.inf, np.float32)
+    mark_covered(times, grid, body, 3.0)
+    rows, columns = np.indices(times.shape)
+    middles = np.stack([columns * 0.05 - 0.475, rows * 0.05 - 0.495], axis=-1)
+    points = shapely.points(geometry.rotate(middles, -heading))
+    assert np.array_equal(times == 3.0, shapely.contains(shape, points))
+
+
+def test_cells_are_forgotten_once_they_are_too_old_and_those_beside_the_robot_are_new():
+    times = np.array([[5.0, 6.0, 4.9, -np.inf]], np.float32)
+    grid = Grid(-0.125, -0.125, 0.25, 1.0, 0.0)  # the first is under the robot
+    forget_old(times, grid, 0.25, now=9.0, oldest=5.0)
+    assert times.tolist() == [[9.0, 9.0, -np.inf, -np.inf]]
+    forget_old(times, grid, 0.0, now=9.5, oldest=9.0)
+    assert times.tolist() == [[9.5, 9.0, -np.inf, -np.inf]]

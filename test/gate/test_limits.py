@@ -14,6 +14,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import gate
 from nics_drl_bridge.gate.limits import (
     Limits,
+    flush_denormals,
     follow,
     is_implausible,
     is_within,
@@ -201,3 +202,15 @@ def test_a_denormal_speed_is_exactly_zero(speed, bicycle):
     assert (rig.decision.publish, rig.decision.cause) == (True, None)
     assert not rig.decision.twist.any()
     assert rig.state.value[0] == 0.0
+
+
+def test_only_numbers_that_have_lost_digits_count_as_zero():
+    tiny = float(np.finfo(np.float64).tiny)
+    values = np.array([tiny, tiny / 2.0, -tiny, -tiny / 2.0])
+    assert flush_denormals(values).tolist() == [tiny, 0.0, -tiny, 0.0]
+
+
+def test_a_command_of_ten_times_its_limit_is_still_plausible():
+    limits = LIMITS["ackermann"]
+    assert not is_implausible(10.0 * limits.high, limits)
+    assert is_implausible(10.1 * limits.high, limits)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from gate.recorded import WALLS, see
 from gate.rig import PERIOD_S, TICK_S, Rig, config
+from nics_drl_bridge.gate import scan_motion
 from nics_drl_bridge.gate.inputs import Scan
-from nics_drl_bridge.gate.scan_motion import warm_up
+from nics_drl_bridge.gate.scan_motion import SETTINGS, Verdict, judge_motion, warm_up
+from nics_drl_bridge.gate.state import View
 from nics_drl_bridge.geometry import compose, exp
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
@@ -270,3 +274,103 @@ def test_scans_from_before_the_stamps_jumped_back_are_not_compared():
     stamps = [view.stamp_ns for view in scene.state.scan_motion.views]
     assert len(stamps) > 2
     assert max(stamps) <= scene.stamp
+
+
+def views_along(*steps, period_s=0.1):
+    """Views of a robot that drives such steps [m] straight ahead, one after the other."""
+    return tuple(
+        View(round(k * period_s * NS_PER_S), np.array([x, 0.0, 0.0]), np.ones(3))
+        for k, x in enumerate(np.cumsum([0.0, *steps]))
+    )
+
+
+def look(monkeypatch, observed, changed, steps=(0.25, 0.25)):
+    """Judges the last of some views, whose sectors show fractions of the motion."""
+    shown = np.array(observed, float), np.array(changed, float)
+    monkeypatch.setattr(scan_motion, "_compare_scans", lambda *_: shown)
+    *kept, newest = views_along(*steps)
+    return judge_motion(config(), tuple(kept), newest)
+
+
+SHOWN = SETTINGS.sector_share  # what a sector that agrees shows at least
+
+
+@pytest.mark.parametrize(
+    ("observed", "changed", "steps", "held"),
+    [
+        ([0.0] * 5, [0.0] * 5, (0.25, 0.25), True),
+        ([0.0] * 5, [0.5] * 5, (0.25, 0.25), False),  # too much has changed
+        ([0.0] * 3 + [SHOWN] * 2, [0.0] * 5, (0.25, 0.25), True),
+        ([0.0] * 5 + [SHOWN] * 5, [0.0] * 10, (0.25, 0.25), False),
+        ([0.2] * 5, [0.0] * 5, (0.25, 0.25), False),
+        ([-0.2] * 5, [0.0] * 5, (0.25, 0.25), False),
+        ([0.17] * 5, [0.0] * 5, (0.5, 0.125), False),  # the limits shrink by 0.8
+        ([0.17] * 5, [0.0] * 5, (0.125, 0.5), False),
+        ([0.17] * 5, [0.0] * 5, (0.375, 0.125), True),  # at the usual fraction
+        ([0.0] * 5, [0.0] * 5, (0.02, 0.02), True),  # the least motion
+        ([0.0] * 5, [0.0] * 5, (0.02, 0.09), True),  # the least in one half
+    ],
+)
+def test_a_body_is_held_if_most_sectors_show_too_little_of_the_motion(
+    monkeypatch, observed, changed, steps, held
+):
+    verdict = look(monkeypatch, observed, changed, steps)
+    assert verdict.held == held
+    assert verdict.share == np.median(observed)
+    assert verdict.reference.stamp_ns == 0
+
+
+@pytest.mark.parametrize(
+    ("observed", "steps"),
+    [
+        ([0.0] * 4 + [np.nan] * 5, (0.25, 0.25)),  # too few sectors
+        ([0.0] * 5, (0.019, 0.02)),  # too little motion
+        ([0.0] * 5, (0.01, 0.09)),  # in one half
+        ([0.0] * 5, (1.0, 0.1)),
+        ([0.0] * 5, (0.25,)),  # no scan between
+    ],
+)
+def test_too_little_evidence_decides_nothing(monkeypatch, observed, steps):
+    verdict = look(monkeypatch, observed, np.zeros(len(observed)), steps)
+    assert np.isnan(verdict.share)
+    assert not verdict.held
+
+
+@pytest.mark.parametrize(
+    ("turn", "chosen"),
+    [(0.0, 0), (0.6, 0), (0.61, 1), (0.71, 2), (1.4, 2), (1.41, 1), (1.51, None)],
+)
+def test_a_scan_is_compared_with_the_oldest_since_which_the_robot_turned_a_little(
+    monkeypatch, turn, chosen
+):
+    """Not if it turned too far, because a room may repeat itself."""
+    compared = np.zeros(9), np.zeros(9)
+    monkeypatch.setattr(scan_motion, "_compare_scans", lambda *_: compared)
+    views = views_along(0.5, 0.5, 0.5, 0.5)
+    turns = (0.0, 0.1, 0.0, 0.3, turn)
+    *kept, newest = (
+        replace(view, pose=np.array([*view.pose[:2], angle]))
+        for view, angle in zip(views, turns, strict=True)
+    )
+    reference = judge_motion(config(), tuple(kept), newest).reference
+    assert reference == (None if chosen is None else kept[chosen])
+
+
+@pytest.mark.parametrize(
+    ("share", "held", "before_s", "since_s"),
+    [
+        (0.1, True, None, 9.0),
+        (0.1, True, 8.0, 8.0),
+        (0.1, True, 7.9, 9.0),  # forgotten
+        (np.nan, False, 8.0, 8.0),
+        (np.nan, False, 7.9, None),
+        (1.0, False, 8.5, None),
+    ],
+)
+def test_a_contradiction_lasts_until_a_scan_agrees_or_it_is_forgotten(
+    share, held, before_s, since_s
+):
+    before_ns = None if before_s is None else round(before_s * NS_PER_S)
+    since_ns = None if since_s is None else round(since_s * NS_PER_S)
+    verdict = Verdict(share, held)
+    assert scan_motion._update_held_since(before_ns, verdict, 9 * NS_PER_S) == since_ns

@@ -8,7 +8,15 @@ import pytest
 from gate.recorded import see
 from gate.rig import LIDAR, Rig, config
 from nics_drl_bridge import geometry
-from nics_drl_bridge.gate.evidence import add_view, find_movers, find_obstacles
+from nics_drl_bridge.gate import evidence
+from nics_drl_bridge.gate.evidence import (
+    add_view,
+    estimate_motion,
+    find_movers,
+    find_obstacles,
+    get_beams,
+)
+from nics_drl_bridge.gate.evidence_kernels import Tolerance
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.inputs import Odometry, Scan, Tick
 from nics_drl_bridge.gate.shield import CREEP_SPEED
@@ -299,3 +307,56 @@ def test_unknown_beams_are_a_wall_on_the_outline_and_blind_directions_are_none()
         assert (wall[:, 0] == 0.25).any() == front
         assert (wall[:, 0] >= -0.05).all()
         assert front or (wall[:, 1] < 0.0).all()
+
+
+def test_a_decision_that_publishes_nothing_adds_no_command():
+    rig = Rig(config(shield=SHIELD))
+    rig.run(1.5)  # it publishes zeros
+    before = rig.state.recent
+    rig.now += 1e-3
+    assert not rig.odom(stamp_ns=rig.stamp + 1).publish
+    assert rig.state.recent is before
+    assert rig.tick().publish
+    assert rig.state.recent[-1][0] == rig.now
+
+
+@pytest.mark.parametrize(("missing", "moves"), [(0, True), (1, False)])
+def test_the_first_and_the_last_beam_are_neighbours_only_in_a_full_circle(
+    missing, moves
+):
+    count = LIDAR.beams - missing
+    given = config(shield=SHIELD, beam_angles=LIDAR.angles[:count])
+    old = np.full(count, 2.0, np.float32)
+    new = old.copy()
+    new[[0, -1]] = 1.0
+    turned = np.array([0.0, 0.0, 8 * LIDAR.angle_increment])  # away from the gap
+    views = (View(0, np.zeros(3), old), View(NS_PER_S // 10, turned, new))
+    entered = np.flatnonzero(find_movers(given, SHIELD, views))
+    assert entered.tolist() == ([0, count - 1] if moves else [])
+
+
+@pytest.mark.parametrize(
+    ("sectors", "turn", "expected"),
+    [(4, 0.3, 0.0), (3, 0.3, 0.3), (4, 0.0199, 0.0199), (4, 0.0201, 0.0)],
+)
+def test_scans_correct_a_turn_that_is_worth_it_if_half_the_directions_show_another(
+    sectors, turn, expected
+):
+    """The wheels turn, and the scans show a body that does not."""
+    rng = np.random.default_rng(0)
+    ranges = rng.uniform(1.0, 3.0, LIDAR.beams).astype(np.float32)
+    ranges[LIDAR.beams * sectors // 8 :] = np.inf
+    old = View(0, np.zeros(3), ranges)
+    new = View(NS_PER_S // 10, np.array([0.0, 0.0, turn]), ranges)
+    motion = estimate_motion(old, new, get_beams(GIVEN), Tolerance(0.03, 0.0))
+    assert motion == pytest.approx([0.0, 0.0, expected], abs=5e-3)
+
+
+@pytest.mark.parametrize("turn", [0.05, -2.0])
+def test_the_turns_and_the_motions_that_are_tried_are_close_to_each_other(turn):
+    turns = evidence._vary_turn(np.array([0.0, 0.0, turn]))[:, 2] / turn
+    assert (np.diff(np.abs(turns - 1.0)) > -1e-9).all()  # odometry's comes first
+    assert np.diff(np.sort(turns)).max() * abs(turn) < 0.03
+    assert (turns.min(), turns.max()) == pytest.approx((0.0, 1.3))
+    lesser = evidence._lessen_motion(np.array([0.49, 0.0, 0.0]))[:, 0]
+    assert lesser == pytest.approx(0.049 * np.arange(10))

@@ -10,6 +10,8 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.gate.evidence_kernels import (
     MountedBeams,
     Tolerance,
+    find_beam,
+    mark_agreeing,
     mark_entered,
 )
 from nics_drl_bridge.gate.footprint import get_body
@@ -143,3 +145,37 @@ def test_an_unknown_beam_shows_no_free_ground_now_or_before(unknown):
     tolerance = Tolerance(0.03, 0.0)
     mark_entered(entered, new, ranges, lidar, np.zeros(3), 10.0, tolerance)
     assert entered[20] == (not unknown)
+
+
+@pytest.mark.parametrize("step", [np.pi / 180, -np.pi / 180])
+@pytest.mark.parametrize("heading", [0.0, 2.5, -2.5])
+def test_a_point_belongs_to_the_beam_towards_it_whatever_the_mount(step, heading):
+    lidar = MountedBeams(-2.0 * np.sign(step), step, 0.2, -0.1, heading)
+    for beam in range(360):
+        for off in (-0.49, 0.49):
+            angle = lidar.first + (beam + off) * step + heading
+            x = lidar.x + 3.0 * np.cos(angle)
+            y = lidar.y + 3.0 * np.sin(angle)
+            assert find_beam(x, y, lidar) == beam
+
+
+@pytest.mark.parametrize(
+    ("twist", "tolerance", "agrees"),
+    [
+        ((0.0, 0.0, 0.0), (0.0, 0.0), True),
+        ((0.25, 0.0, 0.0), (0.25, 0.0), True),  # at the tolerance
+        ((0.25, 0.0, 0.0), (0.1875, 0.0), False),
+        ((0.25, 0.0, 0.0), (0.0, 0.25), True),
+        ((0.25, 0.0, 0.0), (0.0, 0.125), False),
+        ((0.0, 0.0, np.pi / 2), (0.25, 0.0), False),
+    ],
+)
+def test_a_beam_agrees_if_it_ends_where_the_old_scan_did(twist, tolerance, agrees):
+    """Four beams, of which the first looks ahead; every second one is compared."""
+    lidar = MountedBeams(0.0, np.pi / 2, 0.0, 0.0, 0.0)
+    ranges = np.array([1.0, 9.0, np.inf, 9.0], np.float32)
+    old = np.array([1.0, 2.0, 1.0, 2.0], np.float32)
+    agreeing = np.ones((1, 2), np.bool_)
+    motions = np.array([twist])
+    mark_agreeing(agreeing, ranges, old, lidar, motions, Tolerance(*tolerance), 2)
+    assert agreeing.tolist() == [[agrees, False]]

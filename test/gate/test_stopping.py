@@ -15,6 +15,7 @@ from nics_drl_bridge.gate.stopping import (
     get_wheelbase,
     require_possible,
     shield_config,
+    warn_of_age_limit,
 )
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.robot.noise import Noise
@@ -201,6 +202,7 @@ def test_a_robot_that_no_shield_fits_may_drive_without_one():
         ({"scan_age_s": 0.1}, "'scan_age'"),  # any message is a little late
         ({"odom_age_s": 0.1}, "'odom_age'"),
         ({"scan_rate": 2.0}, "scan comes every 0.5 s"),
+        ({"odom_rate": 2.0, "odom_age_s": 2.0}, ""),
         ({"odom_rate": 1.5, "odom_age_s": 2.0}, "too rarely to be judged within 1 s"),
     ],
 )
@@ -211,3 +213,8 @@ def test_a_setting_with_which_the_gate_is_never_armed_is_refused(changes, words)
         return
     with pytest.raises(ConfigError, match=words):
         require_possible(given)
+
+
+@pytest.mark.parametrize(("period_s", "warns"), [(0.1, False), (0.25, True)])
+def test_an_age_limit_that_suits_only_a_faster_policy_is_warned_of(period_s, warns):
+    assert bool(warn_of_age_limit(config(command_age_s=0.25), period_s)) == warns

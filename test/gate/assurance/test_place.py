@@ -36,6 +36,16 @@ def test_a_robot_that_drives_into_something_is_in_contact():
     assert place.outcome.speed == pytest.approx(0.5, abs=0.1)
 
 
+def test_what_touches_a_robot_at_the_first_step_of_an_episode_walked_into_it():
+    place = Place(builtin_model("mecanum"), "empty")
+    place.begin(Job("ram", 0))
+    wall = np.array([place.truth.walls[:, [0, 2]].max(), 0.0, 0.0])
+    place._sim.put_robot(0, wall, np.zeros(place._sim.data.state.shape[-1]))
+    place.track = [wall]
+    place.step(np.zeros(3))
+    assert (place.outcome.walked_into, place.outcome.contact) == (True, False)
+
+
 def test_a_robot_that_turns_a_corner_into_a_wall_is_in_contact():
     place = Place(builtin_model("jackal"), "empty")
     place.begin(Job("ram", 0))

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.assurance import run as runs
+from nics_drl_bridge.generator import builtin_model
 
 from .samples import PROTOCOL
 
@@ -96,3 +98,10 @@ def test_another_json_file_is_no_result(tmp_path, text):
     (tmp_path / runs.RESULT).write_text(text)
     with pytest.raises(ConfigError, match="is not a result of nics assure"):
         runs.begin(tmp_path, PROTOCOL)
+
+
+def test_a_model_that_no_shield_fits_is_refused_before_any_episode():
+    model = builtin_model("differential")
+    single = replace(model, lidar=model.lidar.model_copy(update={"beams": 1}))
+    with pytest.raises(ConfigError, match="the shield needs a lidar"):
+        runs.Run(PROTOCOL, single)
