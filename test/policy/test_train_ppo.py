@@ -228,6 +228,19 @@ def test_a_batch_of_one_transition_learns_from_its_own_advantage():
     assert any(gradient.any() for gradient in gradients)
 
 
+@pytest.mark.parametrize("index", [-1, 10_000])
+def test_a_saved_index_outside_the_discrete_actions_is_refused(index):
+    lean, _ = pair("discrete")
+    lean.collector.last_observations = lean.collector.worlds.reset()
+    rollout, _ = lean.collector.collect()
+    state = lean.state()
+    state["rollout"] = rollout._asdict()
+    lean.restore(state)
+    rollout.actions[0, 0] = index
+    with pytest.raises(ValueError, match="the index of an action is not from 0"):
+        lean.restore(state)
+
+
 def test_a_rollout_is_that_of_stable_baselines3_over_ends_of_episodes_and_time_limits():
     lean, theirs = pair(
         log_std=-30.0

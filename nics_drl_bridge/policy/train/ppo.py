@@ -223,6 +223,8 @@ class LeanPpo:
         _restore_array(normaliser.std, state["normaliser"]["std"])
         self.steps = state["steps"]
         rollout = state["rollout"]
+        if rollout and self.networks.is_discrete:
+            _check_indices(rollout["actions"], self.networks.actor.widths[-1])
         self._rollout = rollout and Rollout(**rollout)
         self._successes.extend(state["recent"])
         _restore_array(self.collector.last_observations, state["last"])
@@ -236,3 +238,12 @@ def _restore_array(target: AnyArray, saved: AnyArray) -> None:
     if saved.dtype != target.dtype or saved.shape != target.shape:
         raise ValueError(f"an array is {saved.dtype} of shape {saved.shape}")
     target[:] = saved
+
+
+def _check_indices(actions: AnyArray, count: int) -> None:
+    """Raises ValueError unless all indices of discrete actions are below `count`.
+
+    The compiled gradients index memory by them without a check.
+    """
+    if not ((actions >= 0) & (actions < count)).all():
+        raise ValueError(f"the index of an action is not from 0 to {count - 1}")
