@@ -173,6 +173,16 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path):
             read_checkpoint(path)
 
 
+@pytest.mark.parametrize("resumed", [False, True])
+def test_a_folder_with_a_checkpoint_of_an_earlier_version_is_refused(tmp_path, resumed):
+    old = tmp_path / "seed_3" / "checkpoint.pt"
+    old.parent.mkdir()
+    old.write_bytes(b"old")
+    order = TrainOrder(settings(), [3], tmp_path, episodes=1, resumed=resumed)
+    with pytest.raises(ConfigError, match="is a checkpoint of an earlier version"):
+        run(order)
+
+
 class Harmful:
     def __reduce__(self):
         return (open, ("harm", "w"))

@@ -173,7 +173,7 @@ def test_loss_and_gradients_are_those_of_stable_baselines3(actions):
     theirs.policy.optimizer.step = lambda: None
     theirs.train()
     logged = theirs.logger.name_to_value["train/loss"]
-    assert lean.learner.differentiate(batch) == pytest.approx(logged, rel=1e-5)
+    assert lean.learner.compute_gradients(batch) == pytest.approx(logged, rel=1e-5)
     gradients, of_deviation = gradients_of(lean)
     norm = np.linalg.norm(lean.learner.optimiser.gradients)
     factor = min(1.0, theirs.max_grad_norm / norm)  # as they have clipped theirs
@@ -189,7 +189,7 @@ def test_actor_and_critic_learn_at_once_while_a_core_is_free_to_the_same_bits(
 ):
     lean, theirs = pair()
     batch = filled(lean, theirs)
-    loss = lean.learner.differentiate(batch)
+    loss = lean.learner.compute_gradients(batch)
     gradients = lean.learner.optimiser.gradients
     wanted = gradients.copy()
     gradients[:] = 0.0
@@ -201,7 +201,7 @@ def test_actor_and_critic_learn_at_once_while_a_core_is_free_to_the_same_bits(
         lambda job, parts: jobs.append(len(parts)) or together(job, parts),
     )
     lean.learner.core_is_free.set()
-    assert lean.learner.differentiate(batch) == loss
+    assert lean.learner.compute_gradients(batch) == loss
     assert jobs == [2]
     assert np.array_equal(gradients, wanted)
 
@@ -210,22 +210,35 @@ def test_a_batch_of_fewer_rows_than_the_one_before_has_gradients_of_its_own():
     lean, theirs = pair()
     batch = filled(lean, theirs)
     few = Transitions(*(each[:7] for each in batch))
-    lean.learner.differentiate(few)
+    lean.learner.compute_gradients(few)
     gradients = lean.learner.optimiser.gradients
     wanted = gradients.copy()
-    lean.learner.differentiate(batch)
+    lean.learner.compute_gradients(batch)
     assert not np.array_equal(gradients, wanted)
-    lean.learner.differentiate(few)
+    lean.learner.compute_gradients(few)
     assert np.array_equal(gradients, wanted)
 
 
 def test_a_batch_of_one_transition_learns_from_its_own_advantage():
     lean, theirs = pair()
     one = Transitions(*(each[:1] for each in filled(lean, theirs)))
-    assert np.isfinite(lean.learner.differentiate(one))
+    assert np.isfinite(lean.learner.compute_gradients(one))
     gradients, _ = gradients_of(lean)
     assert all(np.isfinite(gradient).all() for gradient in gradients)
     assert any(gradient.any() for gradient in gradients)
+
+
+@pytest.mark.parametrize("index", [-1, 10_000])
+def test_a_saved_index_outside_the_discrete_actions_is_refused(index):
+    lean, _ = pair("discrete")
+    lean.collector.last_observations = lean.collector.worlds.reset()
+    rollout, _ = lean.collector.collect()
+    state = lean.state()
+    state["rollout"] = rollout._asdict()
+    lean.restore(state)
+    rollout.actions[0, 0] = index
+    with pytest.raises(ValueError, match="the index of an action is not from 0"):
+        lean.restore(state)
 
 
 def test_a_rollout_is_that_of_stable_baselines3_over_ends_of_episodes_and_time_limits():
@@ -235,7 +248,7 @@ def test_a_rollout_is_that_of_stable_baselines3_over_ends_of_episodes_and_time_l
     _, callback = theirs._setup_learn(1, ConvertCallback(lambda *_: True))
     theirs.collect_rollouts(theirs.env, callback, theirs.rollout_buffer, STEPS)
     lean.collector.networks.weights[:] = lean.networks.weights
-    lean.collector.last = lean.collector.worlds.reset()
+    lean.collector.last_observations = lean.collector.worlds.reset()
     driven, ended = lean.collector.collect()
     rollout = lean.learner.compute_transitions(driven)
     buffer = theirs.rollout_buffer

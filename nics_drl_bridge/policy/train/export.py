@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.env.task import Task
@@ -33,9 +32,7 @@ with extensions.require_modules("the export of a policy"):
         run_rows,
     )
     from nics_drl_bridge.policy.train import network_graph
-    from nics_drl_bridge.policy.train.network_graph import RawNetwork
-
-Normaliser = tuple[ArrayLike, ArrayLike, float]
+    from nics_drl_bridge.policy.train.network_graph import RawNetwork, Standardisation
 
 
 def export_policy(
@@ -43,7 +40,7 @@ def export_policy(
     task: Task,
     simulator_model: SimulatorModel,
     path: str | Path,
-    normaliser: Normaliser | None = None,
+    normaliser: Standardisation | None = None,
     provenance: Mapping[str, Any] | None = None,
     max_episode_steps: int | None = None,
 ) -> policy_file.PolicyFile:
@@ -59,7 +56,7 @@ def export_policy(
             f"{file}: a policy file's name ends with {SUFFIX!r}; change it."
         )
     network = _make_raw_network(model, task, normaliser)
-    graph = network.graph
+    graph = network.onnx_model
     network_graph.add_commands(graph, task)
     golden = _make_golden(network, task, str(file))
     text = make_contract(
@@ -83,7 +80,7 @@ def export_policy(
 
 
 def _make_raw_network(
-    model: Any, task: Task, normaliser: Normaliser | None
+    model: Any, task: Task, normaliser: Standardisation | None
 ) -> RawNetwork:
     if isinstance(model, Actor):
         if normaliser is not None:
@@ -100,7 +97,7 @@ def _make_raw_network(
 def _make_golden(network: RawNetwork, task: Task, source: str) -> dict[str, Rows]:
     """Returns golden pairs of the graph. Raises PolicyError if the network's own differ."""
     seen = draw_golden_observations(task)
-    session = open_session(network.graph.SerializeToString(), source)
+    session = open_session(network.onnx_model.SerializeToString(), source)
     state = network.state
     start = None if state is None else np.full(*state, np.float32)
 

@@ -27,8 +27,8 @@ class Net(NamedTuple):
     # (L + 1,) number of inputs, then the number of outputs of each layer
     widths: Integers
     # (L, at least n times the maximum width) outputs of each layer
-    kept: Singles
-    spare: Singles  # (2, same size) gradients of outputs
+    layer_outputs: Singles
+    output_gradients: Singles  # (2, same size) of two consecutive layers, in turns
 
 
 class Transitions(NamedTuple):
@@ -51,7 +51,7 @@ def forward(net: Net, observations: Singles) -> Singles:
         ins = net.widths[k]
         outs = net.widths[k + 1]
         middle = at + ins * outs
-        out = net.kept[k, : n * outs].reshape(n, outs)
+        out = net.layer_outputs[k, : n * outs].reshape(n, outs)
         np.dot(rows, net.weights[at:middle].reshape(outs, ins).T, out)
         at = middle + outs
         rows = out
@@ -68,7 +68,7 @@ def forward(net: Net, observations: Singles) -> Singles:
 def backward(net: Net, observations: Singles, gradient: Singles) -> None:
     """Writes the gradients of the weights, given the outputs' gradients (n, C), after `forward`.
 
-    `gradient` must be the first of the spare arrays.
+    `gradient` must be in the first row of `output_gradients`.
     """
     n = len(observations)
     at = len(net.weights)
@@ -78,12 +78,16 @@ def backward(net: Net, observations: Singles, gradient: Singles) -> None:
         outs = net.widths[k + 1]
         middle = at - outs
         at = middle - ins * outs
-        rows = net.kept[k - 1, : n * ins].reshape(n, ins) if k > 0 else observations
+        rows = (
+            net.layer_outputs[k - 1, : n * ins].reshape(n, ins)
+            if k > 0
+            else observations
+        )
         np.dot(gradient.T, rows, net.gradients[at:middle].reshape(outs, ins))
         net.gradients[middle : middle + outs] = gradient.sum(axis=0)
         if k > 0:
             side = 1 - side
-            ahead = net.spare[side, : n * ins].reshape(n, ins)
+            ahead = net.output_gradients[side, : n * ins].reshape(n, ins)
             np.dot(gradient, net.weights[at:middle].reshape(outs, ins), ahead)
             for i in range(n):
                 for j in range(ins):
@@ -98,7 +102,7 @@ def compute_critic_gradients(
     """Writes the gradients of the critic; returns its weighted loss."""
     values = forward(net, batch.observations)
     n = len(values)
-    out = net.spare[0, :n].reshape(n, 1)
+    out = net.output_gradients[0, :n].reshape(n, 1)
     loss = ZERO
     share = weight / np.float32(n)
     for i in range(n):
@@ -126,7 +130,7 @@ def compute_actor_gradients(
     advantages = batch.advantages
     n = len(outputs)
     actions = batch.actions
-    out = net.spare[0, : outputs.size].reshape(outputs.shape)
+    out = net.output_gradients[0, : outputs.size].reshape(outputs.shape)
     share = ONE / np.float32(n)
     mean = ZERO
     scale = ONE

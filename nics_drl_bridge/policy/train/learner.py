@@ -36,9 +36,9 @@ def make_net(network: Network, gradients: Singles, rows: int) -> Net:
     """Returns a network for the kernels, with its gradients (W,) and memory for `rows`."""
     widths = np.array(network.widths)
     size = rows * max(network.widths)
-    kept = np.empty((len(widths) - 1, size), np.float32)
-    spare = np.empty((2, size), np.float32)
-    return Net(network.weights, gradients, widths, kept, spare)
+    layer_outputs = np.empty((len(widths) - 1, size), np.float32)
+    output_gradients = np.empty((2, size), np.float32)
+    return Net(network.weights, gradients, widths, layer_outputs, output_gradients)
 
 
 def estimate_advantages(
@@ -107,11 +107,11 @@ class Learner:
                 rows = order[begin : begin + self.ppo.batch]
                 # `take` releases the interpreter lock for the collecting thread
                 batch = [field.take(rows, axis=0) for field in transitions]
-                loss = self.differentiate(Transitions(*batch))
+                loss = self.compute_gradients(Transitions(*batch))
                 self.optimiser.step(rate)
         return loss
 
-    def differentiate(self, batch: Transitions) -> float:
+    def compute_gradients(self, batch: Transitions) -> float:
         """Sets the gradients of all weights for a batch; returns the loss."""
         jobs: list[Callable[[], Any]] = [
             partial(
@@ -144,4 +144,4 @@ def warm_up() -> None:
     rows = np.ones((3, 2), np.float32)
     column = rows[:, :1].copy()
     values = column[:, 0].copy()
-    learner.differentiate(Transitions(rows, column, values, values, values))
+    learner.compute_gradients(Transitions(rows, column, values, values, values))

@@ -21,13 +21,16 @@ OPSET = 17
 IR_VERSION = 8  # of that opset; a runtime refuses a version newer than itself
 RAW = "raw"  # output of a network: actions before they are clipped, or logits
 
+Standardisation = tuple[ArrayLike, ArrayLike, float]
+"""Mean (O,), deviation (O,) and limit of a foreign network's observations."""
+
 
 class RawNetwork(NamedTuple):
     """A network without the commands; S is the size of its state, if it has one."""
 
     # ModelProto: maps observations (n, O) to `RAW` (n, C), and states (n, S) to the next ones
-    graph: Any
-    compute: Callable[..., list[Rows]]  # does the same as the graph
+    onnx_model: Any
+    compute: Callable[..., list[Rows]]  # does the same as `onnx_model`
     state: tuple[int, float] | None = None  # S, and the start value of each element
 
 

@@ -52,23 +52,25 @@ class Collector:
         self.steps = steps
         self.rng = rng
         shape = (worlds.num_envs, *worlds.observation_space.shape)
-        self.last: Singles = np.zeros(shape, np.float32)
+        self.last_observations: Singles = np.zeros(shape, np.float32)
 
     def collect(self) -> tuple[Rollout, Ended]:
         """Steps all worlds through a rollout."""
         count = self.worlds.num_envs
         space = self.worlds.action_space
         networks = self.networks
-        observations = np.empty((self.steps + 1, *self.last.shape), np.float32)
+        observations = np.empty(
+            (self.steps + 1, *self.last_observations.shape), np.float32
+        )
         rewards = np.zeros((self.steps, count), np.float32)
         ended = np.zeros((self.steps, count), np.float32)
         actions = []
         log_probs = []
         outcomes: Ended = []
         truncated = [np.zeros(0, np.int64)]
-        final = [self.last[:0]]
+        final = [self.last_observations[:0]]
         for t in range(self.steps):
-            observations[t] = self.normaliser(self.last)
+            observations[t] = self.normaliser(self.last_observations)
             raw = networks.actor(observations[t])
             chosen = networks.draw(raw, self.rng)
             actions.append(chosen)
@@ -76,7 +78,7 @@ class Collector:
             if isinstance(space, gymnasium.spaces.Box):
                 chosen = np.clip(chosen, space.low, space.high)
             step = self.worlds.step(chosen)
-            self.last = step.observations
+            self.last_observations = step.observations
             rewards[t] = step.rewards
             ended[t] = step.ended
             endings = step.endings
@@ -85,7 +87,7 @@ class Collector:
             cut = endings.truncated
             truncated.append(t * count + endings.worlds[cut])
             final.append(self.normaliser(endings.observations[cut]))
-        observations[self.steps] = self.normaliser(self.last)
+        observations[self.steps] = self.normaliser(self.last_observations)
         rollout = Rollout(
             observations,
             np.stack(actions),
@@ -143,7 +145,7 @@ class LeanPpo:
         """Learns until all steps are done, or the watch ends the training."""
         watch.begin(self.steps)
         if self._rollout is None:
-            self.collector.last = self.collector.worlds.reset()
+            self.collector.last_observations = self.collector.worlds.reset()
             self._take(watch, *self.collector.collect())
         while self._rollout is not None:
             watch.keep(self.steps)
@@ -202,7 +204,7 @@ class LeanPpo:
             "normaliser": {"mean": normaliser.mean, "std": normaliser.std},
             "steps": self.steps,
             "recent": list(self._successes),
-            "last": self.collector.last,
+            "last": self.collector.last_observations,
             "rollout": self._rollout and self._rollout._asdict(),
             "random": [
                 part.rng.bit_generator.state for part in (self.collector, self.learner)
@@ -221,9 +223,11 @@ class LeanPpo:
         _restore_array(normaliser.std, state["normaliser"]["std"])
         self.steps = state["steps"]
         rollout = state["rollout"]
+        if rollout and self.networks.is_discrete:
+            _check_indices(rollout["actions"], self.networks.actor.widths[-1])
         self._rollout = rollout and Rollout(**rollout)
         self._successes.extend(state["recent"])
-        _restore_array(self.collector.last, state["last"])
+        _restore_array(self.collector.last_observations, state["last"])
         collecting, learning = state["random"]
         self.collector.rng.bit_generator.state = collecting
         self.learner.rng.bit_generator.state = learning
@@ -234,3 +238,12 @@ def _restore_array(target: AnyArray, saved: AnyArray) -> None:
     if saved.dtype != target.dtype or saved.shape != target.shape:
         raise ValueError(f"an array is {saved.dtype} of shape {saved.shape}")
     target[:] = saved
+
+
+def _check_indices(actions: AnyArray, count: int) -> None:
+    """Raises ValueError unless all indices of discrete actions are below `count`.
+
+    The compiled gradients index memory by them without a check.
+    """
+    if not ((actions >= 0) & (actions < count)).all():
+        raise ValueError(f"the index of an action is not from 0 to {count - 1}")

@@ -49,6 +49,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.threads import one_blas_thread
 
 CHECKPOINT = "checkpoint.npz"
+OLD_CHECKPOINT = "checkpoint.pt"  # of version 1, which can't be resumed
 SETTINGS = "settings.yaml"
 LOCK = ".lock"
 EVALUATION = "evaluation.json"
@@ -429,7 +430,14 @@ def _check(
     check_seeds(seeds, GREATEST_SB3_SEED)
     if not seeds or len(set(seeds)) < len(seeds):
         raise ConfigError(f"seeds {list(seeds)}: give one or more, without duplicates.")
-    begun = any((out / f"seed_{seed}" / CHECKPOINT).is_file() for seed in seeds)
+    folders = [out / f"seed_{seed}" for seed in seeds]
+    for folder in folders:
+        if (folder / OLD_CHECKPOINT).is_file():
+            raise ConfigError(
+                f"{folder / OLD_CHECKPOINT}: is a checkpoint of an earlier version, which can't "
+                "be resumed; choose another --out, or remove it."
+            )
+    begun = any((folder / CHECKPOINT).is_file() for folder in folders)
     if begun and not resumed:
         raise ConfigError(
             f"{out}: contains checkpoints of these seeds; add --resume, or choose another --out."

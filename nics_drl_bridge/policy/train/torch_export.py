@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
-from numpy.typing import ArrayLike
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.policy.file import onnx_graph
 from nics_drl_bridge.policy.file.contract import Rows
-from nics_drl_bridge.policy.train.network_graph import OPSET, RAW, RawNetwork
-
-Standardisation = tuple[ArrayLike, ArrayLike, float]
+from nics_drl_bridge.policy.train.network_graph import (
+    OPSET,
+    RAW,
+    RawNetwork,
+    Standardisation,
+)
 
 
 class Standardised(torch.nn.Module):  # type: ignore[misc]
