@@ -52,7 +52,7 @@ def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
         file.writelines(parts)
 
 
-# What is unfinished lies in a folder with a hidden name next to the final path. Its writer holds a
+# Unfinished output is kept in a hidden folder next to the final path. Its writer holds a
 # lock on the folder, which the system releases when the writer ends, even if it crashes. `tempfile`
 # would make files that only their owner can read; here the umask applies.
 

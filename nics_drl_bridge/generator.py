@@ -203,7 +203,7 @@ def generate(
         anyway: True accepts a model that predicts hardly better than a robot at rest.
         sensors: sensors besides the lidar.
     """
-    # It takes time to load, and most users open a model that was generated before.
+    # Imported here because it loads slowly, and most users only open existing models.
     from nics_drl_bridge.identify.identify import identify, join_recordings
     from nics_drl_bridge.identify.report import explain_uselessness, format_report
 

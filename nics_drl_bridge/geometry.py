@@ -113,6 +113,16 @@ def east_and_north(longitude: Array, latitude: Array) -> tuple[Array, Array]:
     return y, north
 
 
+def accumulate(steps: ArrayLike) -> Array:
+    """Returns the running totals (T + 1,) of steps (T,), which begin with 0."""
+    return np.append(0.0, np.cumsum(steps))
+
+
+def measure_path(positions: Array) -> Array:
+    """Returns the path length (T,) from the first of positions or poses (T, 2 or more) [m]."""
+    return accumulate(np.hypot(*np.diff(positions[:, :2], axis=0).T))
+
+
 def has_crossing_edges(corners: Array) -> bool:
     """True if an edge of a closed outline (K, 2) touches or crosses another one.
 
@@ -125,7 +135,7 @@ def has_crossing_edges(corners: Array) -> bool:
     if (start == end).all(axis=1).any():
         return True
     # Two edges cross if each one's line separates the ends of the other, and their boxes overlap,
-    # which matters for edges on one line. Matrices (K, K) are of edge by edge.
+    # which matters for edges on one line. Matrices (K, K) have a row and a column for each edge.
     end_sides = _find_sides(end, start, edge)
     is_separated = _find_sides(start, start, edge) * end_sides <= 0.0
     low = np.minimum(start, end)

@@ -75,7 +75,7 @@ def kernel(
         )
     options: dict[str, Any] = {"nopython": True, "nogil": True, "error_model": "numpy"}
     options |= {"boundscheck": None, "no_cfunc_wrapper": True}
-    # Each is set: numba would take those that are not from the kernel that calls this one first.
+    # All options are set; numba would take missing ones from the first kernel that calls this one.
     options |= {"_nrt": allocates, "forceinline": inline}
     options |= {"fastmath": {"contract"} if contracts else False}
     options |= {"inline": "always"} if view else {}

@@ -13,7 +13,7 @@ PATIENCE_NS = NS_PER_S // 2
 
 
 def find_common_step(dt: float, periods: tuple[float, ...]) -> int:
-    """Returns the longest step, in steps `dt` of the model [s], that suits the periods [s] best."""
+    """Returns the greatest common divisor of periods [s], as a number of model steps `dt` [s]."""
     return math.gcd(*(max(1, round(period / dt)) for period in periods))
 
 

@@ -116,3 +116,11 @@ def test_exp_and_log_undo_each_other_at_the_seam_too():
     for largest in (3.14, 2e-4, 0.0):
         twist[:, 2] = rng.uniform(-largest, largest, len(twist))
         assert np.abs(geometry.log(geometry.exp(twist)) - twist).max() < 1e-8
+
+
+def test_path_lengths_ignore_the_heading_and_begin_with_0():
+    poses = np.array(
+        [[0.0, 0.0, 0.0], [3.0, 4.0, 1.0], [3.0, 4.0, 2.0], [3.0, 2.0, 2.0]]
+    )
+    assert geometry.measure_path(poses) == pytest.approx([0.0, 5.0, 5.0, 7.0])
+    assert geometry.accumulate([]).tolist() == [0.0]

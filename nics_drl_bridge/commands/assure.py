@@ -47,15 +47,15 @@ def assure(
     """Tries to make a gated policy fail, and writes the evidence.
 
     Args:
-        limits: The gate's limits: shipped ones (differential) or a YAML file.
-        model: A model's folder, or a shipped robot; else the policy's own.
-        world: A shipped world or a YAML file; repeatable; arena, clutter and crowd.
+        limits: Limits of the gate: shipped (differential) or a YAML file.
+        model: A model's folder, or a shipped robot. Default: the policy's.
+        world: A shipped world or a YAML file; repeatable. Default: arena, clutter and crowd.
         episodes: Number of episodes in process.
         seed: Seed of the first episode.
-        randomisation: Drawn for each episode of the policy: a shipped one or a YAML file.
+        randomisation: Randomisation of the policy's episodes: shipped or a YAML file.
         faults: Number of faults injected over DDS, in real time; needs ROS 2.
         control: Run everything without the gate, as a control that must find failures.
-        replay: Only repeat this episode of a run.
+        replay: Repeat only the episode with this seed.
         out: Folder for all output; an existing run is continued.
 
     Examples:
@@ -202,14 +202,14 @@ def _replay(run: "Run", seed: int, out: Path, as_json: bool) -> None:
             return
         raise BackendError(
             f"--replay {seed}: {trial.kind} could not be injected, because the robot did not "
-            "move; try again, or look into the logs."
+            "move; try again, or read the logs."
         )
     rows, _ = runs.read_rows(out / runs.LOG, list(order.list_trials()))
     row = json.loads(format_json(run.drive(trial)))
     picture = out / f"replay_{seed}.png"
     _draw_episode(run, trial, "contact" if row["contact"] else "no contact", picture)
-    kept = [one for one in rows if one["seed"] == seed and one["gated"] == trial.gated]
-    same = kept == [row]
+    in_run = [r for r in rows if r["seed"] == seed and r["gated"] == trial.gated]
+    same = in_run == [row]
     comparison = "as in the run" if same else "not in the run, or different there"
     text = f"{_list_values(row)}\nthis episode is {comparison}; its picture: {picture}"
     console.print_line(as_json, text, **row, same=same, picture=str(picture))

@@ -60,8 +60,7 @@ ROBOT_OPTIONS = ("--robot", "--model")  # synonyms in every command
 ROBOT = Option(*ROBOT_OPTIONS, autocompletion=ROBOTS)
 WORLD = Option("--world", "--scene", autocompletion=WORLDS)
 
-# Options of several commands. Those without help mean something else in each command, whose
-# docstring says it.
+# Options of several commands. Options without help are described in each command's docstring.
 RobotOption = Annotated[str, ROBOT]
 OptionalRobotOption = Annotated[str | None, ROBOT]
 WorldsOption = Annotated[list[str] | None, WORLD]
@@ -82,18 +81,18 @@ RandomisationOption = Annotated[
     str | None,
     Option(
         autocompletion=complete_names("randomisation"),
-        help="Drawn for each episode: a shipped one (mild) or a YAML file.",
+        help="Randomisation of each episode: shipped (mild) or a YAML file.",
     ),
 ]
 TaskOption = Annotated[
     str | None,
-    Option(help="Your own task that the policy is for: path/to/file.py:ClassName."),
+    Option(help="The policy's task, if it is your own: path/to/file.py:ClassName."),
 ]
 GateOption = Annotated[
     str | None,
     Option(
         metavar="LIMITS",
-        help="Drive through the gate and its shield, with these limits: shipped ones "
+        help="Drive through the gate and its shield, with these limits: shipped "
         "(differential) or a YAML file.",
         autocompletion=complete_names("limits"),
     ),
@@ -110,8 +109,8 @@ RolesOption = Annotated[
     list[str] | None,
     Option(
         metavar="ROLE=TOPIC",
-        help="For a bag: topic of a role, as odom=/wheel_odom. Roles: scan, odom, cmd_vel, "
-        "pose, imu.",
+        help="For a bag: topic of a role, such as odom=/wheel_odom; repeatable. Roles: scan, odom, "
+        "cmd_vel, pose, imu.",
     ),
 ]
 NamespaceOption = Annotated[
@@ -121,7 +120,7 @@ ImuOption = Annotated[
     str,
     Option(
         metavar="TOPIC",
-        help="Topic of the gyro; auto: imu or imu/data, if there is one; none.",
+        help="Topic of the gyro; auto: imu or imu/data, if present; none: no gyro.",
     ),
 ]
 HARDWARE_OPTIONS = (

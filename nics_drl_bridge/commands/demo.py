@@ -24,11 +24,11 @@ def demo(
     """Runs the whole chain once, from a recording to a report.
 
     Args:
-        recording: A drive; by default a textbook one.
-        out: Folder for everything the demo writes.
-        robot: Shipped, or a YAML file; else the recording's own, or differential.
+        recording: A recorded drive. Default: a drive of the textbook model.
+        out: Folder for all output.
+        robot: A shipped robot or a YAML file. Default: the recording's, else differential.
         world: A shipped world or a YAML file.
-        episodes: Episodes in process, and again over DDS.
+        episodes: Number of episodes in process, repeated over DDS.
         policy: Skip training: use a policy file, a shipped one or a baseline.
         train_steps: Environment steps to train.
 

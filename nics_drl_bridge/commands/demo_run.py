@@ -109,7 +109,7 @@ class Demo:
         """Returns the results with the same episodes over DDS, and one by the deployed nodes."""
         policy = results.learned.policy
         there = self._time("driving over DDS", self._drive, DDS, policy)
-        reached = [each.seed for each in there if each.result == "success"]
+        reached = [episode.seed for episode in there if episode.result == "success"]
         seed = [*reached, 0][0]
         live = self._time("deploying", self._deploy, results.model, policy, seed)
         return replace(results, there=there, live=live)
@@ -160,10 +160,12 @@ class Demo:
 
     def learn(self, model: SimulatorModel) -> Learned:
         """Trains a policy, unless one is given or a module is missing. Raises BridgeError."""
-        given = self._plan.policy
-        if given is not None:
-            open_policy(given, model)
-            return Learned(given, f"The policy {given!r} was given; none was trained.")
+        policy = self._plan.policy
+        if policy is not None:
+            open_policy(policy, model)
+            return Learned(
+                policy, f"The policy {policy!r} was given; none was trained."
+            )
         missing = extensions.find_lacking(extensions.TRAINING)
         if missing is None:
             return self._train(model)
@@ -310,12 +312,12 @@ class Demo:
             if not witness.sees(START_S):
                 simulator.check()
                 raise BackendError(
-                    f"{simulator.node} publishes nothing after {START_S:g} s; look at its log, "
+                    f"{simulator.node} has published nothing for {START_S:g} s; see its log, "
                     f"{simulator.log}."
                 )
             try:
                 armed = witness.arm("", START_S, False, lambda _: None)
-            finally:  # a node that ended says more than a gate that is missing
+            finally:  # the error of a node that ended explains a missing gate
                 for process in processes:
                     process.check()
             if not armed.granted:

@@ -34,11 +34,11 @@ def doctor(
     """Checks a robot or a bag against a model; sends nothing to it.
 
     Args:
-        bag: A bag to check; by default the live robot.
+        bag: A bag to check. Default: the live robot.
         model: Check against a model's folder, or a shipped robot (differential).
         policy: Check against a policy file instead.
         duration: Time to listen to a robot [s].
-        install: Check this machine instead: which features work here.
+        install: Check which features work on this machine instead.
         load: Measure a vehicle's nodes on this machine instead.
 
     Examples:

@@ -125,7 +125,10 @@ def drive_in(
     say: Say = lambda _: None,
     conditions: Conditions = NO_CONDITIONS,
 ) -> list[Episode]:
-    """Drives episodes in one of `PLACES` and ends its node, if any. Raises BridgeError."""
+    """Drives episodes in one of `PLACES` with the model `name`; ends the node that it starts.
+
+    Raises BridgeError.
+    """
     model = open_model(name)
     check_place(place, model.robot)
     ranges = conditions.ranges
@@ -328,7 +331,10 @@ def limit_time(
     world: AnyWorld,
     say: Say,
 ) -> Conditions:
-    """Sets the time limit (the policies', or one for robot and world); warns if it is short."""
+    """Returns conditions with a time limit, and warns if it is short.
+
+    It is that of the conditions, else the longest of the policies, else one for robot and world.
+    """
     pace = find_pace(model, [world])
     limits = [
         contract.max_episode_steps
@@ -380,8 +386,8 @@ ENDS = r"\.(onnx|ya?ml)$"  # suffixes of a policy or a mapping
 def shorten_name(policy: str, among: Sequence[str]) -> str:
     """Returns the stem of a policy's path, with parent folders if another has the same stem."""
     path, *others = (
-        Path(re.sub(ENDS, "", each)).absolute().parts
-        for each in (policy, *(other for other in among if other != policy))
+        Path(re.sub(ENDS, "", file)).absolute().parts
+        for file in (policy, *(other for other in among if other != policy))
     )
     for count in range(1, len(path)):
         if all(other[-count:] != path[-count:] for other in others):

@@ -25,7 +25,7 @@ def evaluate(
         int | None,
         Option(
             min=1,
-            help=f"Number of episodes; {defaults.EVALUATION_EPISODES}, or 1 on a vehicle.",
+            help=f"Number of episodes. Default: {defaults.EVALUATION_EPISODES}, or 1 on a vehicle.",
         ),
     ] = None,
     seed: console.SeedOption = defaults.EVALUATION_SEED,
@@ -58,9 +58,9 @@ def evaluate(
     Args:
         policies: Policy files, shipped policies (differential), or baselines (dynamic_window, mppi,
             straight, random).
-        model: A model's folder, or a shipped robot; else the policy's own.
+        model: A model's folder, or a shipped robot. Default: the policy's.
         world: A shipped world or a YAML file.
-        places: fast, dds, mujoco_dds or dart_dds; repeatable; by default those of the first three
+        places: fast, dds, mujoco_dds or dart_dds; repeatable. Default: those of the first three
             that work here.
         seed: Seed of the first episode.
         lidar: A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.
@@ -69,13 +69,13 @@ def evaluate(
         ahead: For --shadow without --goal: use the robot's position this much later [s].
         backend: dds, which --hardware implies.
         hardware: Drive the vehicle, through command_gate.
-        start: For --hardware: wait until it is placed at the start, or start where it is.
-        goal: Goal [m], see --goal-frame; else the world's. For --shadow: in map.
+        start: For --hardware: wait until the vehicle is at the start, or start where it is.
+        goal: Goal [m], see --goal-frame; for --shadow in map. Default: the world's.
         goal_frame: For --hardware: the goal is relative to the robot's start (ahead, left), or in
-            map; robot with --start present, else map.
+            map. Default: robot with --start present, else map.
         confirm_beyond: For --hardware: ask for confirmation of goals farther away [m].
-        pose_type: For --hardware: type of `pose`, in map.
-        yes: For --hardware: ask no questions.
+        pose_type: For --hardware: message type of the topic `pose`, in map.
+        yes: For --hardware: do not ask before the vehicle moves.
         arm: For --hardware: arm command_gate.
 
     Examples:

@@ -38,7 +38,7 @@ def install(
     Args:
         packages: tf2_msgs, ackermann_msgs, or the folder of another package with its msg, srv and
             action.
-        prefix: Folder to install into, with a setup.bash to source; by default this environment.
+        prefix: Folder to install into, with a setup.bash to source. Default: this environment.
 
     Examples:
         nics install tf2_msgs
@@ -68,8 +68,8 @@ def install(
         distribution = os.environ.get("ROS_DISTRO", "DISTRO")
         debian = f"ros-{distribution}-{name.replace('_', '-')}"
         raise ConfigError(
-            "nics install: the ROS 2 here does not come from wheels; install "
-            f"{name} with your distribution, as by `sudo apt install {debian}`."
+            "nics install: ROS 2 was not installed from wheels here; install "
+            f"{name} from your distribution, for example `sudo apt install {debian}`."
         )
     place = check_prefix(prefix or Path(sys.prefix))
     check_programs()

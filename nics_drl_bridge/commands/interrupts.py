@@ -1,12 +1,11 @@
-"""SIGINT and SIGTERM end a command; was it interrupted?"""
+"""Lets SIGINT and SIGTERM end a command, and remembers whether Ctrl-C interrupted it."""
 
 import signal
 import threading
-import time
 from types import FrameType
 
 ENDING = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
-_interrupts: list[int] = []  # times [ns] of Ctrl-C
+_interrupts: list[int] = []  # each SIGINT that was received
 
 
 def take_signals() -> None:
@@ -16,7 +15,7 @@ def take_signals() -> None:
         return  # Python can set handlers only in the main thread
     for number, usual in ENDING.items():
         if signal.getsignal(number) is usual:
-            signal.signal(number, _note_and_end)
+            signal.signal(number, _end)
 
 
 def was_interrupted(error: BaseException | None) -> bool:
@@ -39,13 +38,10 @@ def was_interrupted(error: BaseException | None) -> bool:
     return False
 
 
-def _note_and_end(number: int, frame: FrameType | None) -> None:
-    if number == signal.SIGINT:
-        _interrupts.append(time.monotonic_ns())
-    _end(number, frame)
-
-
 def _end(number: int, frame: FrameType | None) -> None:
+    """Handles SIGINT or SIGTERM: remembers Ctrl-C, and raises an exception as soon as possible."""
+    if number == signal.SIGINT:
+        _interrupts.append(number)
     while frame is not None and not frame.f_code.co_name.startswith(
         "_raw_object_cache"
     ):

@@ -68,20 +68,16 @@ def worlds() -> list[Row]:
         x1, y1, x2, y2 = world.extent
         size = f"{x2 - x1:g} x {y2 - y1:g}"
         obstacles = _count_obstacles(world)
-        rows.append(_describe_world(name, size, world.goal_distance, obstacles))
-    rows.append(
-        _describe_world(
-            BARN, f"a set of {len(barn_numbers())} worlds, as barn/7", (), ""
-        )
-    )
-    return rows + [
-        _describe_world(name, "a set of worlds", (), "")
-        for name in list_shipped("world_sets")
-    ]
+        rows.append(_describe_world(name, size, obstacles, world.goal_distance))
+    barn = f"a set of {len(barn_numbers())} worlds, as barn/7"
+    rows.append(_describe_world(BARN, barn))
+    for name in list_shipped("world_sets"):
+        rows.append(_describe_world(name, "a set of worlds"))
+    return rows
 
 
 def _describe_world(
-    name: str, size: str, distance: tuple[float, ...], obstacles: str
+    name: str, size: str, obstacles: str = "", distance: tuple[float, ...] = ()
 ) -> Row:
     far = " to ".join(f"{value:g}" for value in distance)
     return {

@@ -236,7 +236,7 @@ class Generators(AbstractContextManager["Generators", None]):
                 file.write_text(BUILT_ON.sub(here, text), encoding="utf-8")
 
     def find_interfaces(self, source: Source) -> Interfaces:
-        """Returns which files of a message package can be built. Raises ConfigError if none."""
+        """Returns which files of a message package can be built. Raises ConfigError if none can."""
         files = source.list_files()
         left_out = dict[Path, str]()
         for file in files:

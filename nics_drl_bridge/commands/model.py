@@ -233,7 +233,7 @@ def import_(
     """Converts a recording of any format to .npz, using its mapping.
 
     Args:
-        mapping: YAML mapping, docs/recordings.md.
+        mapping: YAML mapping of the recording, see docs/recordings.md.
         out: The .npz file to write.
 
     Examples:
@@ -296,17 +296,17 @@ def generate(
     """Generates a simulator from recordings and writes its folder.
 
     Args:
-        recording: A bag, an .npz recording, or tables with a --map; several of one robot.
+        recording: One or more recordings of a robot: bags, .npz files, or tables with a --map.
         out: Folder of the model to write.
-        robot: Shipped, or a YAML file; else the recording's own, or differential.
-        mapping: YAML mapping of the recording, docs/recordings.md.
+        robot: A shipped robot or a YAML file. Default: the recording's, else differential.
+        mapping: YAML mapping of the recording, see docs/recordings.md.
         topics: YAML file: a bag's topic for each role.
         world: A shipped world or a YAML file.
-        lidar: A shipped lidar or a YAML file; else the robot's own, or paper.
-        sensor: YAML of an additional sensor, docs/sensors.md; repeatable.
+        lidar: A shipped lidar or a YAML file. Default: the robot's, else paper.
+        sensor: YAML file of an additional sensor, see docs/sensors.md; repeatable.
         order: Order of the Taylor model, 1 to 4, or auto.
-        alpha: Pruning of Eq. 2, 0 to 1, or auto for the knee; no effect where the motion is the
-            state.
+        alpha: Pruning threshold of Eq. 2, 0 to 1, or auto for the knee; no effect where the motion
+            is the state.
         assume_textbook: Complete the model from the textbook where the drive shows nothing.
         strict: Fail if an input was not varied independently.
         anyway: Write the model even if it predicts unseen data badly.
@@ -387,12 +387,10 @@ def generate(
 
 def names_of_sources(recordings: Sequence[Path]) -> list[str]:
     """Returns the names of recordings for a report: the path of one, or short names of several."""
-    if len(recordings) == 1:
-        return [str(recordings[0])]
     names = [path.name for path in recordings]
-    if len(set(names)) == len(names):
+    if len(names) > 1 and len(set(names)) == len(names):
         return names
-    return [str(path) for path in recordings]
+    return list(map(str, recordings))
 
 
 def drive(
@@ -409,11 +407,11 @@ def drive(
     For training without a recording; `nics generate` makes a more accurate simulator from one.
 
     Args:
-        out: Folder to write; by default <robot>_model.
+        out: Folder to write. Default: <robot>_model.
         robot: A shipped robot (see nics list robots) or a YAML file.
-        recording: An .npz to save the drive in, like one of a real robot.
-        lidar: A shipped lidar or a YAML file; else the robot's own, or paper.
-        duration: Duration [s].
+        recording: Save the drive in this .npz file, like a drive of a real robot.
+        lidar: A shipped lidar or a YAML file. Default: the robot's, else paper.
+        duration: Duration of the drive [s].
         seed: Seed of the random commands.
 
     Examples:
@@ -458,7 +456,7 @@ def urdf(
 
     Args:
         model: A shipped robot, or the folder of a model.
-        out: File to write; by default <robot>.urdf.
+        out: File to write. Default: <robot>.urdf.
 
     Examples:
         nics urdf my_robot --out my_robot.urdf

@@ -29,7 +29,7 @@ def arm(
     """Arms command_gate, or explains why it refuses.
 
     Args:
-        reset: First release a latched stop, for example of nics stop.
+        reset: First release a latched stop, for example after nics stop.
 
     Examples:
         nics arm
@@ -55,7 +55,7 @@ def stop(
     """Stops one robot, or all, through the emergency stop of its gate.
 
     Args:
-        namespace: Namespace of the robot to stop; by default all robots are stopped.
+        namespace: Namespace of the robot to stop. Default: all robots.
 
     Examples:
         nics stop
@@ -66,7 +66,7 @@ def stop(
         from nics_drl_bridge.nodes.operator import Operator
     stopped = {}
     with Operator() as operator:
-        # Nothing is printed before all gates were called: a halted terminal would hold that up.
+        # All gates are called before anything is printed, because a paused terminal blocks.
         answers = list(operator.stop(namespace, wait))
     for answer in answers:
         stopped[answer.node] = answer.granted

@@ -30,7 +30,7 @@ def info(
     """Checks a policy file and shows its training and requirements.
 
     Args:
-        file: A policy file, the name of a shipped one, or a foreign one's mapping.
+        file: A policy file, the name of a shipped one, or the mapping of a foreign policy.
 
     Examples:
         nics policy info differential --json

@@ -48,20 +48,20 @@ def train(
     """Trains policies in the fast simulator, and evaluates them.
 
     Args:
-        task: A task, or path/to/file.py:ClassName.
+        task: A task of this package, or path/to/file.py:ClassName.
         robot: A shipped robot (differential), a YAML file, or the folder of a model.
-        settings: Shipped settings (navigation_differential), or a YAML file; else those of the
-            robot, or of the shipped robot that moves like it.
+        settings: Shipped settings (navigation_differential), or a YAML file. Default: those of
+            the robot, else of the shipped robot that moves like it.
         world: Train in this world only; repeat to train in several.
         algorithm: ppo or sac.
         seeds: One or more: --seeds 0 1 2.
-        steps: Environment steps.
-        episodes: Evaluation episodes in each world.
+        steps: Number of environment steps.
+        episodes: Number of evaluation episodes in each world.
         out: Folder of the run.
-        resume: Continue an interrupted --out.
+        resume: Continue the interrupted run in --out.
         engine: lean or sb3 (Stable-Baselines3), in this process; ray: a cluster.
-        address: Ray cluster: auto (this machine's) or HOST:PORT; else a new one.
-        env_runners: Ray processes that share the worlds; default: one per CPU.
+        address: Ray cluster: auto (this machine's) or HOST:PORT. Default: a new one.
+        env_runners: Number of Ray processes that share the worlds. Default: one per CPU.
         watch: Show some of the worlds on a page, as nics watch does.
 
     Examples:
@@ -79,8 +79,8 @@ def train(
         _check_resumed(out, bool(settings), named)
     if watch and engine not in (None, *OWN):
         raise ConfigError(
-            f"--watch --engine {engine}: worlds of other processes are not shown; "
-            "leave out --watch, or --engine."
+            f"--watch --engine {engine}: worlds in other processes can't be shown; "
+            "remove --watch or --engine."
         )
     further_seeds = seeds_of_words(more_seeds or [], seeds is not None)
     check_training(task, robot, world or [], [*(seeds or []), *further_seeds], out)
@@ -218,7 +218,7 @@ def check_engine(engine: str | None, of_clusters: dict[str, Any]) -> None:
         for name, value in of_clusters.items():
             if value is not None:
                 raise ConfigError(
-                    f"--{name}: belongs to --engine ray; add that, or leave it out."
+                    f"--{name}: requires --engine ray; add it, or remove this option."
                 )
 
 
@@ -307,7 +307,7 @@ def _run(
         summaries = [s for result in results for s in result.summaries.values()]
         if not any(summary.success.value > 0.0 for summary in summaries):
             typer.echo(
-                "no episode was a success: does the task's `info` contain `is_success`?",
+                "no episode succeeded; check that the task's `info` contains `is_success`",
                 err=True,
             )
     typer.echo(f"see it drive: nics watch {policy} --world {world}{task_option}")

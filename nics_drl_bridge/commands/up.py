@@ -156,7 +156,7 @@ def end_all(processes: Sequence[ChildProcess]) -> None:
 
 @contextmanager
 def end_nodes_by_signals() -> Iterator[None]:
-    """Lets SIGHUP and the like end the nodes properly; restores the handlers afterwards."""
+    """Lets all `SIGNALS` end the nodes properly; restores the handlers afterwards."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
     for number, handler in before.items():
         # Ignored signals stay ignored: SIGHUP under nohup.

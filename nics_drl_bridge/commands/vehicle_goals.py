@@ -108,7 +108,7 @@ class VehicleEpisode:
         return options
 
     def sentence(self) -> str:
-        """Describes where to place the vehicle and where it will drive."""
+        """Says where to place the vehicle and where it will drive."""
         ahead, left = self.seen
         sides = f"{abs(ahead):.2f} m {'ahead' if ahead >= 0.0 else 'back'}"
         sides += f" and {abs(left):.2f} m to the {'left' if left >= 0.0 else 'right'}"

@@ -27,15 +27,15 @@ def warmup(
     """Compiles the simulator in advance, once per machine.
 
     Args:
-        all_kernels: Compile those of planners, gate, estimator, training and identification too.
+        all_kernels: Also compile planners, gate, estimator, training and identification.
         for_demo: Compile what nics demo needs: also training, estimator and gate.
-        for_wheel: All for x86-64-v3, into the package's folder, for `make wheel`.
+        for_wheel: Compile all for x86-64-v3 into the package's folder, for `make wheel`.
 
     Examples:
         nics warmup
     """
     begin = time.monotonic()
-    # numba reads these at its import. It makes an error message for each type that it tries.
+    # numba reads these at import. Highlighting is slow: it formats an error for each type it tries.
     os.environ["NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING"] = "1"
     if for_wheel:
         os.environ |= {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""}

@@ -46,15 +46,15 @@ def watch(
     """Shows a policy, live topics or a bag on a page in the browser.
 
     Args:
-        model: A model's folder, or a shipped robot; else the policy's own.
-        world: A shipped world (circles) or a YAML file; several times: side by side.
+        model: A model's folder, or a shipped robot. Default: the policy's.
+        world: A shipped world (circles) or a YAML file; repeat to show several side by side.
         seed: Seed of the first episode.
         lidar: A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.
         ros: Show live topics instead.
         bag: Show a recorded drive instead.
-        record: Write .mp4 or .gif instead of a page.
+        record: Write a .mp4 or .gif file instead.
         episodes: For --record: number of episodes.
-        port: Port of the page; 0 takes any.
+        port: Port of the page; 0 chooses a free one.
         browser: Open the page in a browser.
 
     Examples:

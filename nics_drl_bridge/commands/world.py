@@ -76,8 +76,8 @@ def import_(
         tuple[float, float] | None,
         Option(
             metavar="MIN MAX",
-            help="From start to goal [m]; else from "
-            f"{defaults.IMPORT_GOAL_DISTANCE_M:g} m on.",
+            help="Distance from start to goal [m]. Default: at least "
+            f"{defaults.IMPORT_GOAL_DISTANCE_M:g} m.",
         ),
     ] = None,
     clearance: float = defaults.IMPORT_CLEARANCE_M,
@@ -94,15 +94,15 @@ def import_(
 
     Args:
         files: Gazebo's .world or .sdf, Nav2's map .yaml, or a picture.
-        out: The .yaml to write, or a folder; by default in this folder, named after the file.
-        name: Name of the world; else that of the file.
-        start: Where robots start [m, rad]; else anywhere.
-        goal: Position of the goal [m]; else anywhere.
+        out: The .yaml to write, or a folder. Default: this folder, named after the file.
+        name: Name of the world. Default: that of the file.
+        start: Where robots start [m, rad]. Default: anywhere.
+        goal: Position of the goal [m]. Default: anywhere.
         clearance: Free space around the footprint [m].
-        height: For SDF: height above z = 0 at which geometry is cut, the lidar's [m].
-        bounds: For SDF: the field [m]; by default around all obstacles.
-        without: For SDF: a model to leave out, such as a robot; * matches anything. May be given
-            several times.
+        height: For SDF: height of the lidar above z = 0, at which geometry is cut [m].
+        bounds: For SDF: bounds of the field [m]. Default: around all obstacles.
+        without: For SDF: a model to leave out, such as a robot; * matches anything.
+            Repeatable.
         skip_unknown: For SDF: skip and list meshes and other unsupported shapes.
         resolution: For a picture: side of a pixel [m].
 
@@ -269,10 +269,10 @@ def draw(
     For a set, such as barn or a folder of files, it draws the world of the episode.
 
     Args:
-        out: File to write; by default <world>_drawn.png.
+        out: File to write. Default: <world>_drawn.png.
         seed: Seed of the episode.
         robot: A shipped robot (see nics list robots) or a YAML file.
-        footprint: Radius of a round robot instead [m].
+        footprint: Draw a round robot of this radius instead [m].
 
     Examples:
         nics world draw clutter --seed 3
@@ -334,7 +334,7 @@ def map_(
     map_server --ros-args -p yaml_filename:=room_map.yaml`.
 
     Args:
-        out: File to write; by default <world>_map.yaml.
+        out: File to write. Default: <world>_map.yaml.
         seed: Seed of the episode.
         robot: A shipped robot (see nics list robots) or a YAML file.
         resolution: Maximum side of a cell [m].

@@ -334,7 +334,7 @@ class Estimator:
         bridged = self._end_gap(measurement)
         judgement = self._correct(measurement, not bridged)
         if judgement.outcome is Acceptance.OUTLIER and not bridged:
-            # The relative pose of the next odometry then spans this one.
+            # The clone is kept, so the next odometry's relative pose spans this one as well.
             return judgement
         if fused is not None:
             self._gyro = fused.gyro
@@ -368,6 +368,7 @@ class Estimator:
     def _replace_turn(
         self, measurement: Measurement, fused: FusedOdometry
     ) -> Measurement:
+        """Returns an odometry with the fused turn, and with the gyro's noise if that is larger."""
         noise = measurement.noise
         if fused.rate_variance > self._noise[Kind.TWIST][2, 2]:
             noise = np.array(self._noise[Kind.TWIST])
@@ -399,6 +400,10 @@ class Estimator:
         return True
 
     def _correct(self, measurement: Measurement, is_continuous: bool) -> Judgement:
+        """Judges a measurement, and corrects by it unless it is an outlier.
+
+        Odometry's relative pose is used only if it `is_continuous`: no gap was just bridged.
+        """
         kind = measurement.kind
         noise = self._scale_noise(kind, measurement.noise)
         expected, jacobian = self._predict_measurement(kind)
@@ -489,7 +494,11 @@ class Estimator:
         noise: Array,
         alternates: bool,
     ) -> Acceptance:
-        """Decides on a measurement beyond its gate, and prepares the filter to use it."""
+        """Judges a measurement beyond its gate, and prepares the filter if it will be used.
+
+        Returns NEWS for a twist that a stuck or pushed robot explains, JUMP after too many
+        consecutive outliers, else OUTLIER.
+        """
         if not (np.abs(innovation) < MAX_INNOVATION).all():
             return Acceptance.OUTLIER
         covariance = self._filter.P

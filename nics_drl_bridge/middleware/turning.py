@@ -243,7 +243,7 @@ def _compute_nis(gyro: Gyro, rate: float) -> float:
 
 def fuse_odometry(
     gyro: Gyro,
-    before: Array,
+    last_fused: Array,
     odom: Array,
     twist: Array,
     now_ns: int,
@@ -252,11 +252,11 @@ def fuse_odometry(
 ) -> FusedOdometry:
     """Fuses the turn since the last odometry, as measured by wheels and gyro.
 
-    The odometry has pose (3,), body twist (3,) and a variance of its yaw rate; `before` (3,) is the
-    fused pose of the last one. `is_at_rest` means that all other data show a robot at rest. Without
-    a gyro in between, or with a faulty one, the wheels' turn is kept.
+    The odometry has pose (3,), body twist (3,) and a variance of its yaw rate; `last_fused` (3,) is
+    the fused pose of the last one. `is_at_rest` means that all other data show a robot at rest.
+    Without a gyro in between, or with a faulty one, the wheels' turn is kept.
     """
-    last = before if gyro.odom is None else gyro.odom
+    last = last_fused if gyro.odom is None else gyro.odom
     step = geometry.log(geometry.between(last, odom))
     updated = gyro._replace(
         odom=np.array(odom),
@@ -266,7 +266,7 @@ def fuse_odometry(
     )
     seconds = (now_ns - gyro.odom_ns) / NS_PER_S
     by_wheels_alone = FusedOdometry(
-        geometry.compose(before, geometry.exp(step)), twist, updated
+        geometry.compose(last_fused, geometry.exp(step)), twist, updated
     )
     if not _covers_odometry(gyro, now_ns) or seconds <= 0.0:
         return by_wheels_alone
@@ -274,7 +274,7 @@ def fuse_odometry(
         by_gyro=updated.odom_integral - gyro.odom_integral,
         by_wheels=float(step[2]),
         seconds=seconds,
-        noise=gyro.variance * max(gyro.period_s, 1e-3) * seconds,
+        gyro_variance=gyro.variance * max(gyro.period_s, 1e-3) * seconds,
         wheels_stand=bool((step == 0.0).all() and (twist == 0.0).all()),
     )
     updated = _compare_turns(updated, turns, gyro.bias)
@@ -294,7 +294,7 @@ def fuse_odometry(
     fused_twist = np.array(twist)
     fused_twist[2] = weight * (gyro.rate - updated.bias) + (1.0 - weight) * twist[2]
     return FusedOdometry(
-        odom=geometry.compose(before, geometry.exp(step)),
+        odom=geometry.compose(last_fused, geometry.exp(step)),
         twist=fused_twist,
         gyro=updated._replace(
             cross=updated.cross - weight * updated.bias_variance * seconds
@@ -310,26 +310,29 @@ class _Turns(NamedTuple):
     by_gyro: float  # integral of the yaw rates, with their bias [rad]
     by_wheels: float  # [rad]
     seconds: float
-    noise: float  # variance of the gyro's turn without that of its bias [rad^2]
+    gyro_variance: float  # of the gyro's turn, without that of its bias [rad^2]
     wheels_stand: bool
 
 
-def _is_faulty(gyro: Gyro, turns: _Turns, before: Gyro) -> bool:
-    """Returns True if the gyro is stuck, implausible, or contradicts the wheels."""
+def _is_faulty(gyro: Gyro, turns: _Turns, previous: Gyro) -> bool:
+    """Returns True if the gyro is stuck, implausible, or contradicts the wheels.
+
+    `previous` holds the estimates before this odometry, whose bias these turns have not changed.
+    """
     wheels_change = abs(gyro.wheels_rate - gyro.wheels_rate_before)
     if wheels_change > FROZEN_CHANGE or not gyro.is_plausible:
         return True
     if turns.wheels_stand:
         return False
-    unbiased = turns.by_gyro - before.bias * turns.seconds
-    variance = turns.noise + before.bias_variance * turns.seconds**2
+    unbiased = turns.by_gyro - previous.bias * turns.seconds
+    variance = turns.gyro_variance + previous.bias_variance * turns.seconds**2
     return gyro.has_contradiction(unbiased, turns.by_wheels, variance)
 
 
 def _weigh_gyro(gyro: Gyro, turns: _Turns, wheels_variance: float) -> float:
     """Returns the weight of the gyro's turn against that of the wheels, from 0 to 1."""
     unbiased = turns.by_gyro - gyro.bias * turns.seconds
-    gyro_variance = turns.noise + gyro.bias_variance * turns.seconds**2
+    gyro_variance = turns.gyro_variance + gyro.bias_variance * turns.seconds**2
     if turns.wheels_stand and abs(unbiased) <= SIGMAS * math.sqrt(gyro_variance):
         return 0.0  # wheels at rest do not turn the robot
     # A difference beyond the gyro's known noise and bias is slip.
@@ -375,7 +378,7 @@ def _learn_bias_at_rest(gyro: Gyro, turns: _Turns) -> Gyro:
     seconds = turns.seconds
     rest_variance = REST_BIAS_STD**2 if turns.wheels_stand else REST_RATE**2 / seconds
     variance = gyro.bias_variance + BIAS_WALK**2 * seconds
-    measured_variance = turns.noise / seconds**2 + rest_variance
+    measured_variance = turns.gyro_variance / seconds**2 + rest_variance
     return _correct_bias(gyro, turns.by_gyro / seconds, variance, measured_variance)
 
 
@@ -386,7 +389,8 @@ def _learn_bias(gyro: Gyro, turns: _Turns, wheels_variance: float) -> Gyro:
     if variance < WHEELS_BIAS**2:  # unequal wheel sizes also turn a robot that fast
         return gyro._replace(bias_variance=variance)
     repeated = max(1.0, ERROR_DURATION_S / seconds)
-    measured_variance = (turns.noise + repeated * wheels_variance) / seconds**2
+    turn_variance = turns.gyro_variance + repeated * wheels_variance
+    measured_variance = turn_variance / seconds**2
     difference = turns.by_gyro - turns.by_wheels
     return _correct_bias(gyro, difference / seconds, variance, measured_variance)
 

@@ -73,16 +73,15 @@ def open_bag(path: str | Path) -> "Iterator[BagFile]":
     check_libraries(path, "reading")
     if path.is_file() and not is_storage(path):
         raise RecordingError(f"{path}: is not a bag; {BAGS}")
-    is_ros_1 = path.suffix == ROS_1
     with ExitStack() as stack:
-        with _refuse_damage(path, is_ros_1):
-            reader: Any = _open_ros_1(path) if is_ros_1 else _open_ros_2(path)
-            bag = BagFile(stack.enter_context(reader), str(path), is_ros_1)
+        with _refuse_damage(path):
+            reader: Any = _open_ros_1(path) if _is_ros_1(path) else _open_ros_2(path)
+            bag = BagFile(stack.enter_context(reader), path)
         yield bag
 
 
 @contextmanager
-def _refuse_damage(path: Path, is_ros_1: bool) -> Iterator[None]:
+def _refuse_damage(path: Path) -> Iterator[None]:
     """Converts any error of a reader on a damaged file to a RecordingError."""
     try:
         yield
@@ -92,11 +91,15 @@ def _refuse_damage(path: Path, is_ros_1: bool) -> Iterator[None]:
         reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         fault = f"can't be read as a bag ({shorten(reason, LONGEST_REASON)})"
         advice = "try `mcap recover` or `ros2 bag reindex` on a copy, or record again"
-        if is_ros_1:
+        if _is_ros_1(path):
             advice = "repair it with `rosbag reindex`, or record again"
         raise RecordingError(
             f"{path}: {fault}; it is damaged or was not closed: {advice}."
         ) from None
+
+
+def _is_ros_1(path: Path) -> bool:
+    return path.suffix == ROS_1
 
 
 def _open_ros_1(path: Path) -> "Ros1Reader":
@@ -234,15 +237,16 @@ def read_times(messages: Sequence[Message]) -> tuple[Nanoseconds, Nanoseconds | 
 class BagFile:
     """A bag opened by `open_bag`; RecordingError if messages of a topic are lost or damaged."""
 
-    def __init__(self, reader: "AnyBag", place: str, is_ros_1: bool = False) -> None:
+    def __init__(self, reader: "AnyBag", path: Path) -> None:
         if not reader.message_count:
             raise RecordingError(
-                f"{place}: contains no messages; record a drive of 20 s or more."
+                f"{path}: contains no messages; record a drive of 20 s or more."
             )
         self._reader = reader
-        self._is_ros_1 = is_ros_1
+        self._path = path
+        self._is_ros_1 = _is_ros_1(path)
         self._store = collect_types(reader.connections)
-        self.place = place  # its name, for errors
+        self.place = str(path)  # its name, for errors
         self._connections: dict[str, list[Connection]] = {}
         for connection in reader.connections:
             self._connections.setdefault(connection.topic, []).append(connection)
@@ -276,7 +280,7 @@ class BagFile:
     def get_definition(self, topic: str) -> str:
         """Returns the ROS 2 definition of a topic's type, with all types that it contains."""
         if self.can_decode(topic):
-            with _refuse_damage(Path(self.place), self._is_ros_1):
+            with _refuse_damage(self._path):
                 definition, _ = self._store.generate_msgdef(
                     self.types[topic], ros_version=2
                 )
@@ -289,7 +293,7 @@ class BagFile:
         decode = self._store.deserialize_cdr
         if self._is_ros_1:
             decode = self._store.deserialize_ros1
-        with _refuse_damage(Path(self.place), self._is_ros_1):
+        with _refuse_damage(self._path):
             for k, (kind, receive_ns, data) in enumerate(self._read_raw(topic)):
                 try:
                     messages.append(Message(receive_ns, decode(data, kind)))
@@ -301,7 +305,7 @@ class BagFile:
 
     def read_serialized(self, topic: str) -> list[tuple[int, bytes]]:
         """Returns all messages of a topic as ROS 2 serializes them: receipt [ns] and bytes."""
-        with _refuse_damage(Path(self.place), self._is_ros_1):
+        with _refuse_damage(self._path):
             raw = self._read_raw(topic)
             if not self._is_ros_1:
                 return [(ns, bytes(data)) for _, ns, data in raw]

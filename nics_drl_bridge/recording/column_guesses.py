@@ -1,7 +1,8 @@
 """Guesses what the columns of a recording are, by their names, units and types.
 
-A column counts as a command only if its name, or the name and type of its topic, shows
-it. A column that may be a command is listed as a candidate. Measurements are neither.
+A column counts as a command only if its name, or the name and type of its topic, says so.
+A column that may be a command is listed as a candidate. A measurement is neither,
+but measured wheel motion may replace missing commands.
 The guesses serve only the draft of a mapping: opening a recording never guesses.
 """
 
@@ -495,15 +496,15 @@ def guess_command(
     for table in tables:
         candidates += _find_candidates(table, pose)
     candidates = _accept_steering(candidates)
-    certain = [each for each in candidates if each.strength >= LIKELY]
+    certain = [c for c in candidates if c.strength >= LIKELY]
     kind, commands = _choose_kind(certain)
     if kind is not None:
         return CommandGuess(kind, commands, {})
     if not certain:
         kind, commands = _choose_kind(list(_find_wheels(tables)))
         if kind is not None:
-            wheels = [each.column for each in commands.values()]
-            others = [each for each in candidates if each.column not in wheels]
+            wheels = [wheel.column for wheel in commands.values()]
+            others = [c for c in candidates if c.column not in wheels]
             named = _choose_kind(others)[1]
             return CommandGuess(kind, commands, named, of_wheels=True)
     if not candidates:
@@ -511,9 +512,9 @@ def guess_command(
             candidates += _find_unexplained(table, pose)
     kind, named = _choose_kind(candidates)
     if kind is None:
-        candidates.sort(key=lambda column: -column.strength)
-        for k, each in enumerate(candidates[:MOST_CANDIDATES]):
-            named[f"command_{k}"] = each
+        candidates.sort(key=lambda candidate: -candidate.strength)
+        for k, candidate in enumerate(candidates[:MOST_CANDIDATES]):
+            named[f"command_{k}"] = candidate
     return CommandGuess(kind, {}, named)
 
 
@@ -522,8 +523,7 @@ def _find_candidates(table: TableSurvey, pose: PoseGuess | None) -> Iterator[Can
     is_twist = table.kind in TWIST_KINDS
     if STANDARD_PACKAGES.match(table.kind) and not is_twist:
         return
-    # A file's name shows its content only if there are other files and one contains the
-    # pose.
+    # A file's name describes its columns only if there are other files, and not for the pose's.
     has_pose = pose is not None and pose.table is table
     context: set[str] = set()
     if table.kind or not (table.is_single or has_pose):

@@ -1,4 +1,4 @@
-"""A drive as it is recorded: what was sent and heard, in memory, and the recording made of it."""
+"""Keeps the sent and received messages of a drive in memory, and makes a recording of them."""
 
 from collections import defaultdict
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from nics_drl_bridge.errors import BackendError, RecordingError
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.messages import get_stamp, read_pose, read_twist
-from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.recording.recording import MeasuredBy, Recording
 from nics_drl_bridge.recording.role_mapping import read_joint_streams
 from nics_drl_bridge.recording.stamping import Nanoseconds, TopicData, stamp_streams
 from nics_drl_bridge.recording.topic_roles import TopicRoles
@@ -25,7 +25,7 @@ SAME_PACE = (0.8, 1.25)
 
 
 class DriveLog:
-    """Keeps a drive in memory; `now` is the clock of receipt [ns], the same as for the stamps."""
+    """Messages of a drive; `now` returns the time of receipt [ns], on the clock of the stamps."""
 
     def __init__(
         self, spec: RobotSpec, roles: TopicRoles, now: Callable[[], int]
@@ -43,7 +43,7 @@ class DriveLog:
         return (self.rows[COMMAND][-1][0] - self.rows[COMMAND][0][0]) / NS_PER_S
 
     def add(self, topic: str, header_ns: int, values: ArrayLike) -> bool:
-        """Add a message; return False if it is not finite or not newer than the last one."""
+        """Adds a message; returns False if it is not finite or not newer than the last one."""
         rows = self.rows[topic]
         values = np.asarray(values, np.float64)
         if (rows and 0 != header_ns <= rows[-1][1]) or not np.isfinite(values).all():
@@ -52,7 +52,7 @@ class DriveLog:
         return True
 
     def take_odometry(self, message: Any) -> Array | None:
-        """Record an odometry; return its pose (3,), or None if it is old, NaN or inf."""
+        """Adds an odometry; returns its pose (3,), or None if it is old, NaN or inf."""
         header = get_stamp(message)
         pose = np.array(read_pose(message))
         if not self.add("odom", header, pose):
@@ -61,16 +61,14 @@ class DriveLog:
         return pose
 
     def take_joints(self, message: Any) -> None:
-        """Record the data of the joints."""
+        """Adds a JointState."""
         self._joints.append(Message(self._now(), message))
 
     def check(self) -> None:
-        """Raise BridgeError if a state is not measured or stamps run at another rate."""
+        """Raises BridgeError if a state is not measured or stamps run at another rate."""
         measured = [v.name for v in self._spec.state if v.must_be_measured]
         if self._joints:
-            read_joint_streams(
-                "joint_states", self._joints, self._spec, self._roles, PLACE
-            )
+            self._read_joints()
         elif measured or self._roles.state:
             what = f"{(measured or ['the state'])[0]} of robot {self._spec.name!r}"
             fix = "has to be measured; start the joints' publisher, or remap the topic."
@@ -85,10 +83,17 @@ class DriveLog:
             fix = "take the time of a simulator by --use-sim-time, or -p use_sim_time:=true."
             raise BackendError(f"topic 'odom': {off}; {fix}")
 
+    def _read_joints(self) -> dict[str, TopicData]:
+        return read_joint_streams(
+            "joint_states", self._joints, self._spec, self._roles, PLACE
+        )
+
     def make_recording(self) -> Recording:
-        """Return all streams on their clocks. Raises RecordingError if too little was received."""
+        """Returns all streams on their clocks. Raises RecordingError if too little was received."""
         topics = {"command": COMMAND, "pose": "odom", "imu": "imu"}
+        measured_by: MeasuredBy = "odometry"
         if len(self.rows["pose"]) >= FEWEST:
+            measured_by = "tracker"
             # for the noise of the odometry
             topics |= {"pose": "pose", "odometry": "odom twist"}
         data: dict[str, TopicData] = {}
@@ -99,25 +104,25 @@ class DriveLog:
         if not data.keys() >= {"command", "pose"}:
             raise RecordingError("recording: nothing was received that could be saved.")
         if len(self._joints) >= FEWEST:
-            data |= read_joint_streams(
-                "joint_states", self._joints, self._spec, self._roles, PLACE
-            )
+            data |= self._read_joints()
         try:
             kept: Any = stamp_streams(data, self._roles.stamps, PLACE)
         except RecordingError:
             # The drive is over: a recording with poorer stamps is better than none.
             kept = stamp_streams(data, "receive", PLACE)
-        tracked = len(self.rows["pose"]) >= FEWEST
         return Recording(
             **kept,
             source=PLACE,
             variables=self._spec.variable_names,
-            measured_by="tracker" if tracked else "odometry",
+            measured_by=measured_by,
         )
 
 
 def estimate_pace(receive: Nanoseconds, header: Nanoseconds) -> float:
-    """Return stamped seconds per second of receipt, from the least delayed message of each half."""
+    """Returns stamped seconds per second of receipt.
+
+    Only the least delayed message of each half is used, because others waited on the way.
+    """
     heard = receive[-1] - receive[0]
     stamped = header[-1] - header[0]
     if heard <= 0 or stamped <= 0:

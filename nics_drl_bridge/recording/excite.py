@@ -318,9 +318,9 @@ class Pattern:
             f"preview of {self.duration:.0f} s: a path of {self.speed.sum() * self.period:.1f} m, "
             f"up to {self.speed.max():.2f} m/s and {np.abs(self.twist[:, 2]).max():.2f} rad/s",
             f"the robot's body needs x {left:+.2f} to {right:+.2f} m and y {low:+.2f} to "
-            f"{high:+.2f} m, seen from where it stands and looks along x",
-            f"it is stopped where its odometry says that it leaves the circle of "
-            f"{self.bound:g} m around its start; it looks out for nothing else: clear that "
+            f"{high:+.2f} m, with the origin at its start and x ahead",
+            f"it is stopped if, by its odometry, it leaves the circle of "
+            f"{self.bound:g} m around its start; it detects no obstacles: clear that "
             "circle, and keep an emergency stop at hand",
         )
 

@@ -153,7 +153,7 @@ def turn_by_gyro(
 
 def chain_poses(pose: Array, relative: Array) -> Array:
     """Returns poses (T + 1, 3) from `pose` (3,) on, each `relative` (T, 3) to the one before."""
-    heading = pose[2] + np.append(0.0, np.cumsum(relative[:, 2]))
+    heading = pose[2] + geometry.accumulate(relative[:, 2])
     shift = geometry.rotate(relative[:, :2], heading[:-1])
     position = pose[:2] + np.append(np.zeros((1, 2)), np.cumsum(shift, axis=0), axis=0)
     return np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
@@ -175,21 +175,22 @@ def _integrate_gyro(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Returns the gyro's turns (T - 1,) [rad] between times (T,), and whether it covers them."""
     span = np.diff(gyro_t)
-    total = np.append(0.0, np.cumsum(0.5 * (yaw_rate[1:] + yaw_rate[:-1]) * span))
+    total = geometry.accumulate(0.5 * (yaw_rate[1:] + yaw_rate[:-1]) * span)
     turn = np.diff(np.interp(t, gyro_t, total))
     # Time without a gyro up to each moment; an interval that contains any is not covered.
-    lost = np.append(0.0, np.cumsum(np.where(span > LONGEST_GAP_S, span, 0.0)))
+    lost = geometry.accumulate(np.where(span > LONGEST_GAP_S, span, 0.0))
     without = np.diff(np.interp(t, gyro_t, lost))
     inside = (t[:-1] >= gyro_t[0] - 1e-9) & (t[1:] <= gyro_t[-1] + 1e-9)
     return turn, np.asarray(inside & (without < 1e-9))
 
 
 def _split_blocks(t: Array, pose: Array, gyro_t: Array, yaw_rate: Array) -> _Blocks:
+    """Splits a drive at the poses nearest to multiples of `BLOCK_S`, and averages both rates."""
     place = np.unique(np.searchsorted(t, np.arange(t[0], t[-1] + 1e-9, BLOCK_S)))
     place = place[place < len(t)]
     at = t[place]
     heading = np.unwrap(pose[:, 2])
-    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
+    path = geometry.measure_path(pose)
     gyro_turn, covered = _integrate_gyro(at, gyro_t, yaw_rate)
     span = np.diff(at)
     usable = covered & (span > 0.5 * BLOCK_S) & (span < 2.0 * BLOCK_S)
@@ -204,6 +205,7 @@ def _split_blocks(t: Array, pose: Array, gyro_t: Array, yaw_rate: Array) -> _Blo
 
 
 def _estimate_bias(blocks: _Blocks) -> GyroBias:
+    """Estimates the bias, and its slope if significant, at rest; else while driving."""
     rest = (blocks.speed < STANDING_MPS) & (np.abs(blocks.odom_rate) < STANDING_RADPS)
     if rest.sum() < FEWEST_AT_REST:
         return _estimate_bias_while_driving(blocks)
@@ -218,18 +220,18 @@ def _estimate_bias(blocks: _Blocks) -> GyroBias:
     when = when[near]
     bias = float(rate.mean())
     middle = float(when.mean())
-    left = rate - bias
+    residual = rate - bias
     slope = 0.0
     if len(rate) >= FEWEST_TO_DRIFT and float(np.ptp(when)) >= DRIFT_SPAN_S:
-        apart = when - middle
-        power = float(apart @ apart)
-        fitted = float(apart @ rate) / power
-        unexplained = left - fitted * apart
+        since_middle = when - middle
+        power = float(since_middle @ since_middle)
+        fitted_slope = float(since_middle @ rate) / power
+        unexplained = residual - fitted_slope * since_middle
         slope_std = max(float(unexplained.std()), LEAST_BIAS_STD) / np.sqrt(power)
-        if abs(fitted) >= DRIFTS * slope_std:
-            slope = fitted
-            left = unexplained
-    std = max(float(left.std() / np.sqrt(len(rate))), LEAST_BIAS_STD)
+        if abs(fitted_slope) >= DRIFTS * slope_std:
+            slope = fitted_slope
+            residual = unexplained
+    std = max(float(residual.std() / np.sqrt(len(rate))), LEAST_BIAS_STD)
     return GyroBias(bias, std, slope, middle, rest_s)
 
 
@@ -260,8 +262,9 @@ def _estimate_scale(
         return np.nan, np.nan, np.nan
     together = float(odom_rate @ gyro_rate)
     scale = together / power
-    left = odom_rate - scale * gyro_rate
-    std = UNLIKE_BLOCKS * float(np.sqrt(left @ left / max(len(left) - 1, 1) / power))
+    residual = odom_rate - scale * gyro_rate
+    variance = residual @ residual / max(len(residual) - 1, 1)
+    std = UNLIKE_BLOCKS * float(np.sqrt(variance / power))
     return scale, std, together / float(np.sqrt(power * odom_power))
 
 
@@ -271,7 +274,7 @@ def _compute_rms(blocks: _Blocks, rate: Array, window_s: float) -> float:
     count = max(1, round(window_s / BLOCK_S))
     if len(turn) < count:
         return np.nan
-    total = np.append(0.0, np.cumsum(turn))
+    total = geometry.accumulate(turn)
     sums = total[count:] - total[:-count]
     # A window across a gap contains less time than its length suggests.
     half = 0.5 * blocks.span

@@ -1,4 +1,4 @@
-"""Finds which axis of an IMU points up, by gravity, for any mounting."""
+"""Finds which axis of an IMU points up from gravity, for any mounting."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

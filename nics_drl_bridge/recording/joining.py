@@ -1,4 +1,4 @@
-"""Joins recordings of one robot into one, as episodes on one time axis that no window crosses.
+"""Joins recordings of one robot into one, as episodes on one time axis with gaps between them.
 
 Each recording is split: its first part is for training, the rest is held out. All
 training parts come first, so that one time separates them from the held-out parts.
@@ -20,7 +20,7 @@ LEARNT_SHARE = 2.0 / 3.0  # fraction of each recording
 # Time between two episodes, longer than any prediction and any search for a delay
 APART_S = 30.0
 LEAD_S = 2.0  # commands kept before an episode, so that states can follow them
-SETTLE_S = 5.0  # time for which the first of these commands is held before them
+SETTLE_S = 5.0  # the first of these commands begins this much earlier
 AFTER_S = 5.0  # commands kept after an episode, for searches of a delay
 SHORTEST_SPLIT_S = 6.0  # shorter recordings are learnt from as a whole
 
@@ -219,5 +219,5 @@ def _describe_join(parts: Sequence[_Part], is_split: bool) -> str:
         split = "the last third of each was held out of the first fit"
     return (
         f"{len(sources)} drives were joined ({names}): {split}; no prediction crosses "
-        "over."
+        "from one to the next."
     )

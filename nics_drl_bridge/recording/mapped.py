@@ -110,7 +110,10 @@ def _split_table(
     for value in (*mapping.command.values(), *mapping.state.values()):
         used.append(reader.locate(value.from_)[0])
     # Stamps that come with the rows continue from one episode to the next.
-    if any(each is not table for each in used) or table.stamps("") is not None:
+    if (
+        any(used_table is not table for used_table in used)
+        or table.stamps("") is not None
+    ):
         return []
     name = next(name for name in source.names if source.get_table(name) is table)
     episodes: list[tuple[str, Source]] = []
@@ -355,7 +358,7 @@ def _read_command_topic(reader: MappedReader, topic: str, spec: RobotSpec) -> St
 def read_pose(
     reader: MappedReader, pose: PoseSource, spec: RobotSpec | None = None
 ) -> Stream:
-    """Reads poses, with their deviations if a covariance is mapped."""
+    """Reads poses (T, 3), with standard deviations if a covariance is mapped."""
     if pose.x is None:
         pose = _complete_pose(reader, pose)
     kinds = dict(schema.SI["pose"])
@@ -555,13 +558,13 @@ def _check_durations(streams: dict[str, Stream], place: str) -> None:
     pose_s = float(np.ptp(streams["pose"].t))
     if pose_s < MIN_POSE_S:
         raise RecordingError(
-            f"{place}: the pose lasts {pose_s:.3g} s; give the `unit:` of its `time:`, "
-            "as s, min or h."
+            f"{place}: the pose lasts {pose_s:.3g} s; add `unit:` to its `time:`, "
+            "such as s, min or h."
         )
     for name, stream in streams.items():
         duration_s = float(np.ptp(stream.t))
         if duration_s and not 1.0 / MOST_RATIO < duration_s / pose_s < MOST_RATIO:
             raise RecordingError(
                 f"{place}: {name} lasts {duration_s:.4g} s, the pose {pose_s:.4g} s; "
-                "give the `unit:` of the `time:` that is wrong."
+                "add `unit:` to the `time:` that has the wrong unit."
             )

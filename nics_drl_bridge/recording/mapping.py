@@ -117,7 +117,7 @@ NO_COMMANDS = PLACES_ON_EARTH | word_set(
 )
 
 NO_COMMAND_NAMED = (
-    "command: names none, but a model learns the robot's motion from its commands; "
+    "command: is empty, but a model learns the robot's motion from its commands; "
     "name its columns, or, if it was not recorded, record it together with the pose, "
     "such as geometry_msgs/Twist on cmd_vel"
 )

@@ -90,7 +90,7 @@ def check_mcap(path: Path) -> None:
                 if crc != record.summary_crc:
                     raise ValueError("the checksum of its summary is wrong")
         if data.tell() != len(data):
-            raise ValueError("there are data after its end")
+            raise ValueError("it contains data after its end")
 
 
 def _import_zstd() -> Any:

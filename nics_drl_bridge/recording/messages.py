@@ -39,7 +39,7 @@ WHEELS = ("left_wheel", "right_wheel")
 
 
 def check_libraries(path: Path, what: str, instead: str = "") -> None:
-    """Raises RecordingError if a library that `reading` or `writing` a bag needs is missing."""
+    """Raises RecordingError if a library for bags is missing; `what` is `reading` or `writing`."""
     for library in LIBRARIES:
         if find_spec(library) is None:
             raise RecordingError(
@@ -63,7 +63,7 @@ def make_typestore() -> "Typestore":
 def collect_types(
     connections: "Sequence[Connection]", header: bool = True
 ) -> "Typestore":
-    """Returns the message types that a bag defines, and those of `make_typestore` otherwise.
+    """Returns the message types of `make_typestore`, replaced by those that a bag defines.
 
     With `header`, the bag's own type of headers is used, which decodes messages of ROS 1; without,
     the type of ROS 2, which converts them.

@@ -159,7 +159,7 @@ class Recording:
         step = np.diff(t)
         is_gap = np.diff(self.episode_at(t)) > 0
         step[is_gap] = np.median(step[~is_gap]) if not is_gap.all() else 0.0
-        return np.asarray(t[0] + np.append(0.0, np.cumsum(step)))
+        return np.asarray(t[0] + geometry.accumulate(step))
 
     def driven_s(self, until_s: float = np.inf) -> float:
         """Returns the driving time until a time after the first pose [s], without gaps.
@@ -376,7 +376,7 @@ def is_recording(path: Path) -> bool:
 def _read_arrays(data: bytes) -> dict[str, NDArray[Any]]:
     """Returns the arrays of an `.npz` file. Raises ValueError if it is damaged or too large."""
     if not zipfile.is_zipfile(io.BytesIO(data)):
-        raise ValueError("it is no zip archive")
+        raise ValueError("it is not a zip archive")
     try:
         if files.count_unpacked(io.BytesIO(data)) > files.MOST_BYTES:
             raise ValueError(
@@ -457,7 +457,7 @@ def _is_only_along(pose: Array, scale: float) -> bool:
 
 def select_along_path(pose: Array, apart: float) -> NDArray[np.intp]:
     """Returns the indices of poses (of (T, 3)) that are about `apart` [m] on their path."""
-    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
+    path = geometry.measure_path(pose)
     return np.unique(np.searchsorted(path, np.arange(0.0, path[-1], apart)))
 
 

@@ -9,7 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.geometry import Array, accumulate
 from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.recording.topic_roles import Stamps
@@ -255,7 +255,7 @@ def unwrap_counter(values: Array, size: float) -> tuple[Array, int]:
     """Continues values (T,) across the overflows of a register; returns them and their number."""
     step = np.diff(values)
     turns = -np.round(step / size) * (np.abs(step) > size / 2.0)
-    return values + size * np.append(0.0, np.cumsum(turns)), int(np.abs(turns).sum())
+    return values + size * accumulate(turns), int(np.abs(turns).sum())
 
 
 def describe_counter(values: Array) -> str:
@@ -265,7 +265,7 @@ def describe_counter(values: Array) -> str:
     step = np.abs(np.diff(values))
     growth = float(abs(values[-1] - values[0]))
     if growth > max(GROWN, ONE_WAY * step.sum()):
-        return f"went on by {growth:.10g}"
+        return f"grew by {growth:.10g}"
     size = find_overflow(values, (1.0,), BITS)
     if size is None:
         return ""
@@ -359,7 +359,7 @@ def _join_after_jumps(t: Array, rows: NDArray[np.intp], name: str) -> tuple[Arra
         f"{name}: the clock was set {direction} {count} ({first}); the parts were "
         f"joined, a usual step of {usual:.3g} s apart."
     )
-    return t + np.append(0.0, np.cumsum(np.where(is_jump, usual - step, 0.0))), note
+    return t + accumulate(np.where(is_jump, usual - step, 0.0)), note
 
 
 def _find_stray(t: Array) -> NDArray[np.bool_]:

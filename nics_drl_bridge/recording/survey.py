@@ -257,7 +257,7 @@ def inspect_tables(source: Source) -> list[TableSurvey]:
 
 
 def _correct_units(tables: Sequence[TableSurvey]) -> None:
-    """Chooses units of stamps with which all tables last about as long as those in seconds."""
+    """Corrects units of stamps so that each table lasts about as long as the tables in seconds."""
     durations = [
         float(np.ptp(table.t))
         for table in tables

@@ -207,7 +207,7 @@ class _Topics:
             ]
             if len(topics) > 1:
                 several = ", ".join(f"{name} ({self.types[name]})" for name in topics)
-                fault = f"each of several topics could be {role}: {several}"
+                fault = f"several topics could be {role}: {several}"
                 advice = f"choose one with --topic {role}={topics[0]}"
                 if role != "cmd_vel":
                     advice += f", or {role}={NONE} for none"
@@ -223,7 +223,7 @@ class _Topics:
         if roles == ("cmd_vel",):
             advice += " with the pose, since a model learns from the robot's commands"
         advice += ", or, if another topic holds them, name it with --map, which "
-        advice += "`nics inspect BAG --map my.yaml` begins"
+        advice += "`nics inspect BAG --map my.yaml` drafts"
         for role in roles:
             fitting = self._find_fitting(role)
             if fitting:

@@ -237,7 +237,7 @@ class MappedReader:
             if behaviour:
                 raise RecordingError(
                     f"{self.source.place}: {value.from_!r} is a counter that "
-                    f"{behaviour}, no speed: write `{{from: {value.from_}, unit: ticks, "
+                    f"{behaviour}, not a speed: write `{{from: {value.from_}, unit: ticks, "
                     f"ticks_per_turn: ...}}` for {name}."
                 )
         if not value.counts:
@@ -310,7 +310,7 @@ def _check_whole_seconds(table: Table, time: schema.Time, t: Array) -> None:
             fix = f"time: [{column}, {fraction}]"
             break
     raise RecordingError(
-        f"{table.place}: the stamps {column!r} are whole seconds, of {rows_a_second} "
+        f"{table.place}: the stamps {column!r} are whole seconds with {rows_a_second} "
         f"rows each; write `{fix}` into the mapping, or choose another column."
     )
 

@@ -104,7 +104,10 @@ def write_bag(
 def _list_topics(
     recording: Recording, spec: RobotSpec
 ) -> Iterator[tuple[str, str, Stream, Callable[[Array], Content]]]:
-    """Yields topic, type, stream and contents of a message, but for its header, per row."""
+    """Yields for each topic its name, type, stream, and a function from a row to a message.
+
+    The message has no header yet.
+    """
     yield (
         "/cmd_vel",
         topic_roles.TWIST,
@@ -334,17 +337,17 @@ def open_bag_sink(
 def _explain_failure(
     path: Path, error: BaseException, unfinished: Path | None
 ) -> RecordingError:
-    """Returns the error of a bag that could not be written, and what is `unfinished` of it."""
+    """Returns the error of a bag that could not be written; `unfinished` contains its data."""
     reason = str(error) or type(error).__name__
     if isinstance(error, RecordingError):
         reason = error.reason or "could not be finished"
     elif isinstance(error, OSError) and error.strerror:
         reason = error.strerror  # without the path
-    rest = "nothing was written yet, choose another place"
+    rest = "nothing was written; choose another place"
     if unfinished is not None:
         rest = (
-            f"what was written until then lies in {unfinished}, recover it with `mcap recover` or "
-            "`ros2 bag reindex` where there is room"
+            f"the data written so far are in {unfinished}: recover them with `mcap recover` or "
+            "`ros2 bag reindex` on a disk with enough space"
         )
     return RecordingError(f"{path}: {reason}; {rest}.")
 

@@ -17,7 +17,7 @@ from nics_drl_bridge.report import html
 Blocks = Sequence[str]
 HEADS = ("claim", "failures", "rate of failures, 95 %", "without the gate")
 MAX_CLUSTERS = 50
-MAX_SEEDS = 5  # of a cluster that the table shows
+MAX_SEEDS = 5  # maximum number of seeds that the table shows for a cluster
 NOT_SHOWN = (
     "Safety of the vehicle: this is evidence from a simulator, not a certificate. The bounds hold "
     "for the scenes, drivers and delays that this protocol draws.",
@@ -145,7 +145,10 @@ def _describe_control(claim: str, control: Mapping[str, Any]) -> str:
             f"Control, {name}: without the gate, {_format_counts(figures)} trials fail, so this "
             "protocol can find such a failure."
         )
-    return f"Control, {name}: without the gate nothing fails either, so its zero proves nothing."
+    return (
+        f"Control, {name}: nothing fails without the gate either, so zero failures with it "
+        "prove nothing."
+    )
 
 
 def _make_failures(

@@ -98,7 +98,7 @@ def check_presence(facts: Facts, _: Expected) -> Findings:
         ends = facts.topics.get(facts.names[role])
         types = () if ends is None else ends.types
         if len(types) > 1 or set(types) - set(KINDS[role]):
-            fix = f"publish {KINDS[role][0]}, or remap the topic that is one"
+            fix = f"publish {KINDS[role][0]}, or remap a topic of that type"
             yield error("type", role, f"is of {' and '.join(types)}", fix)
         elif role == CMD_VEL:
             if facts.live and (ends is None or not ends.asks):
@@ -122,9 +122,7 @@ def check_presence(facts: Facts, _: Expected) -> Findings:
                 fix = f"record it with the others, or name its --namespace{hint}"
             yield error("missing topic", role, what, fix)
         if doctor_facts.TWIST_STAMPED_TYPE in types and not facts.live:
-            fix = (
-                "set `enable_stamped_cmd_vel` where the package's nodes are to take it"
-            )
+            fix = "set `enable_stamped_cmd_vel` for the package's nodes that receive it"
             yield warning("type", role, "is a TwistStamped, not a Twist", fix)
 
 
@@ -263,9 +261,9 @@ def check_clock(facts: Facts, _: Expected) -> Findings:
 def check_motion(facts: Facts, expected: Expected) -> Findings:
     """Checks odometry and commands for NaN, wrong units and wrong signs."""
     yield from _check_odometry(facts, expected.robot)
-    if _turns_against_commands(facts):
+    if _turns_opposite_to_commands(facts):
         fix = "swap the wheels or invert the sign of angular.z: counter-clockwise is positive"
-        yield error("command", CMD_VEL, "the robot turns against its commands", fix)
+        yield error("command", CMD_VEL, "the robot turns opposite to its commands", fix)
 
 
 def check_turning(facts: Facts, expected: Expected) -> Findings:
@@ -289,7 +287,7 @@ def check_turning(facts: Facts, expected: Expected) -> Findings:
         return
     if turning.mirrored:
         fix = "invert the sign in the driver: the z axis points up, counter-clockwise is positive"
-        yield error("gyro", GYRO, "turns against odometry", fix)
+        yield error("gyro", GYRO, "turns opposite to odometry", fix)
     elif turning.in_degrees:
         what = f"turns {1.0 / turning.scale:.3g} times as far as odometry: degrees per second"
         yield error("gyro", GYRO, what, "make the driver send radians per second")
@@ -359,24 +357,25 @@ def _check_odometry(facts: Facts, robot: RobotSpec) -> Findings:
 
 
 def _check_moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Findings:
+    """Finds jumps of poses (T, 3), and compares the rest with the twists (T, 3)."""
     stamps = np.array(facts.heard[ODOM].stamps_ns, dtype=np.int64)
     dt = np.diff(stamps) * S_PER_NS
-    going = dt > 0.0
-    if going.sum() < LEAST_STEPS:
+    is_forward = dt > 0.0
+    if is_forward.sum() < LEAST_STEPS:
         return
     step = np.diff(poses[:, :2], axis=0)
     far = np.hypot(step[:, 0], step[:, 1])
-    jumps = going & (far > JUMP_M) & (far > JUMP * fastest * dt)
-    if jumps.sum() > 0.2 * going.sum():
-        speed = float(np.median((far[going] / dt[going])[jumps[going]]))
-        what = f"positions change by {speed:.0f} per second, but it reaches {fastest:.2g} m/s"
+    jumps = is_forward & (far > JUMP_M) & (far > JUMP * fastest * dt)
+    if jumps.sum() > 0.2 * is_forward.sum():
+        speed = float(np.median(far[jumps] / dt[jumps]))
+        what = f"positions change by {speed:.0f} per second; the maximum is {fastest:.2g} m/s"
         yield odometry_error(what, "publish positions in metres, not millimetres")
         return
     if jumps.any():
         what = f"jumps {jumps.sum()} times, by up to {far[jumps].max():.2f} m"
         fix = "odom must be continuous (REP-105): corrections belong in map -> odom"
         yield odometry_error(what, fix)
-    yield from _check_rates(poses, twists, dt, going & ~jumps)
+    yield from _check_rates(poses, twists, dt, is_forward & ~jumps)
 
 
 def _check_rates(
@@ -385,17 +384,20 @@ def _check_rates(
     """Compares the twists with the changes of the poses in the steps (T - 1,) to `keep`."""
     step = np.diff(poses[:, :2], axis=0)
     turn = np.asarray(wrap_angle(np.diff(poses[:, 2])))
-    moves = 0.5 * (twists[1:] + twists[:-1]) * dt[:, None]
+    claimed = 0.5 * (twists[1:] + twists[:-1]) * dt[:, None]
     middle = poses[:-1, 2] + 0.5 * turn
     ahead = np.cos(middle) * step[:, 0] + np.sin(middle) * step[:, 1]
     path = np.hypot(step[:, 0], step[:, 1])[keep].sum()
-    if path > LEAST_PATH_M or np.abs(moves[keep, 0]).sum() > 1.0:
+    if path > LEAST_PATH_M or np.abs(claimed[keep, 0]).sum() > 1.0:
         yield from _compare_rates(
-            "linear.x", ahead[keep], moves[keep, 0], UNITS[:3], "m/s"
+            "linear.x", ahead[keep], claimed[keep, 0], UNITS[:3], "m/s"
         )
-    if np.abs(turn[keep]).sum() > LEAST_TURN_RAD or np.abs(moves[keep, 2]).sum() > 2.0:
+    if (
+        np.abs(turn[keep]).sum() > LEAST_TURN_RAD
+        or np.abs(claimed[keep, 2]).sum() > 2.0
+    ):
         yield from _compare_rates(
-            "angular.z", turn[keep], moves[keep, 2], UNITS[3:], "rad/s"
+            "angular.z", turn[keep], claimed[keep, 2], UNITS[3:], "rad/s"
         )
 
 
@@ -406,10 +408,14 @@ def _compare_rates(
     units: Sequence[tuple[float, str]],
     good: str,
 ) -> Findings:
+    """Compares real displacements (T,) with those that a field of the twist claims (T,).
+
+    A factor between the two that is not about 1 is explained by the sign or one of the `units`.
+    """
     power = float(real @ real)
     ratio = float(real @ claimed) / power if power > 0.0 else np.inf
     size = float(np.sqrt(power * (claimed @ claimed)))
-    if _is_alike(ratio):
+    if _is_near_1(ratio):
         return
     if size == 0.0 or abs(real @ claimed) < ALIKE * size:
         fix = (
@@ -419,15 +425,15 @@ def _compare_rates(
         return
     what = f"twist.{field} is {ratio:.3g} times the rate of the pose"
     fix = "take both from the same odometry, the twist in the body's frame"
-    if _is_alike(-ratio):
+    if _is_near_1(-ratio):
         what = f"twist.{field} has the opposite sign of the rate of the pose"
         fix = "invert the sign: forward and counter-clockwise are positive (REP-103)"
     for factor, name in units:
-        if _is_alike(ratio / factor):
+        if _is_near_1(ratio / factor):
             what = f"{what}: {name}"
             fix = f"publish the twist in {good}"
             break
-        if _is_alike(ratio * factor):
+        if _is_near_1(ratio * factor):
             what = (
                 f"the pose changes {1 / ratio:.3g} times as fast as twist.{field} says"
             )
@@ -436,11 +442,12 @@ def _compare_rates(
     yield odometry_error(what, fix)
 
 
-def _is_alike(ratio: float) -> bool:
+def _is_near_1(ratio: float) -> bool:
     return 1.0 / TOLERANCE < ratio < TOLERANCE
 
 
-def _turns_against_commands(facts: Facts) -> bool:
+def _turns_opposite_to_commands(facts: Facts) -> bool:
+    """True if the turns of odometry and the latest commands are clearly anti-correlated."""
     heard = facts.heard.get(CMD_VEL)
     odometry = facts.heard.get(ODOM)
     if heard is None or odometry is None or len(facts.poses) < LEAST_STEPS:

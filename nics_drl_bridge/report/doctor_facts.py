@@ -174,7 +174,7 @@ def name_of_gyro(
 def collect_facts_of_bag(
     path: str | Path, namespace: str = "", imu: str = defaults.IMU_TOPIC
 ) -> Facts:
-    """Collects the facts of a robot from a bag. Raises RecordingError if it is none, or damaged."""
+    """Collects the facts of a robot from a bag. Raises RecordingError if that fails."""
     if Path(path).exists() and not is_bag(path):
         advice = f"for another recording run `nics inspect {path}`"
         raise RecordingError(

@@ -44,7 +44,7 @@ LEVERS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0)
 ORDERS = (2.0, math.inf, 1.0)
 NEGLIGIBLE = 0.02  # a bound may exceed the tightest one by this slack
 MIN_FRACTION = 0.05  # lower bound on `TurnBraking.least_turn` and `least_path`
-MAX_MISSED_M = 0.01  # by which separate bounds may underestimate a creeping motion
+MAX_MISSED_M = 0.01  # separate bounds may underestimate a creeping motion by this
 MAX_MOTIONS = 2500
 INSTANT = 1e-6  # 1/(2a) [s^2/m] below which the deceleration counts as infinite
 # Fractions of each command's range whose mixtures are stopped, by the number of commands
@@ -417,7 +417,7 @@ def fit_bound(stops: Stops, radius: float, turns_count: bool) -> Braking:
     stops = stops[is_moving]
     if not len(stops):
         return Braking(0.0, math.inf)
-    # What the fastest point of the footprint sweeps; slack counts on straight ways.
+    # Path of the footprint's fastest point. Only straight motions determine the slack.
     speed = _measure_speed(stops)
     turn_speed = radius * np.abs(stops.twist[:, 2])
     swept = stops.path + radius * stops.travel[:, 2]
@@ -489,8 +489,8 @@ def _fit_tightest(
 ) -> _Fit:
     """Fits distance <= speed * (reaction + pace * inverse) for all stops, with minimum slack.
 
-    The slack is the mean excess of the bound, as a fraction: over all distances, or over the worst
-    ones of no higher speed where it `counts` (K,).
+    The slack is the mean excess of the bound, as a fraction of the distances. With `counts` (K,),
+    only those stops count, each with the longest distance of any that is no faster.
     """
     worst = distance
     counted_speed = speed
@@ -520,8 +520,8 @@ def find_lowest_line(x: Array, y: Array, at: float) -> tuple[float, float]:
     """
     x = np.append(x, 0.0)  # above the origin, the intercept is not negative
     y = np.append(y, 0.0)
-    # A level line touches the highest point. The steeper it is, the further left is the point that
-    # it touches, and around a point right of `at` it sinks there.
+    # The search begins with a level line through the highest point. While the line touches a point
+    # right of `at`, it is lower at `at` if it is tilted about that point until it touches the next.
     touched = int(np.argmax(y))
     slope = 0.0
     while x[touched] > at:

@@ -460,10 +460,9 @@ def build_robot(
 ) -> RobotSpec:
     """Builds a robot from a shipped robot's name, the path of a YAML file, or its content.
 
-    With a `kind` instead of `textbook`, all defaults of the kind may be omitted: names,
-        units and ranges of commands, state and parameters. `ranges` (minimum, maximum)
-        of recorded
-    commands, by name, are the defaults of their ranges. Raises ConfigError for a faulty definition.
+    With a `kind` instead of `textbook`, all defaults of the kind may be omitted: names, units and
+    ranges of commands, state and parameters. `ranges` (minimum, maximum) of recorded commands, by
+    name, are the defaults of their ranges. Raises ConfigError for a faulty definition.
     """
     ranges = ranges or {}
     data = read_definition(definition)
@@ -478,8 +477,8 @@ def build_robot(
         is_recorded = end in ranges.get(c.name, ())  # then the mapping is at fault
         if c.steers and abs(end) > FARTHEST_STEERED and not is_recorded:
             raise ConfigError(
-                f"{source}: key 'command': {c.name} reaches {end:g} rad, which is no "
-                "steering angle of a wheel; angles are in radians."
+                f"{source}: key 'command': {c.name} reaches {end:g} rad, too far "
+                "for a steered wheel; angles are in radians."
             )
     return spec
 

@@ -54,7 +54,7 @@ class Lane:
         self._policy = policy
         self.trail = Track()
         self.seed = seed
-        self._native = world
+        self._original_world = world  # without changes by the user
         self._open(policy, world)
         self.begin()
 
@@ -118,11 +118,11 @@ class Lane:
         Returns True if the env is new. Raises ConfigError for a bad seed.
         """
         self.seed = int(check_seeds([seed])[0])
-        self._native = world or self._native
-        changed = self.world is not self._native
+        self._original_world = world or self._original_world
+        changed = self.world is not self._original_world
         if changed:
             self.close()
-            self._open(self._policy, self._native)
+            self._open(self._policy, self._original_world)
         self.begin()
         return changed
 
@@ -151,7 +151,10 @@ class Lane:
     def rebuild(
         self, policy: str = "", *more: Obstacles, emptied: bool = False
     ) -> None:
-        """Continues from here in a new env, with another policy or other obstacles."""
+        """Continues from here in a new env, with another policy or other obstacles.
+
+        If that fails, the old env and everything else about the lane are restored.
+        """
         shot = self.env.snapshot()
         kept = dict(vars(self))
         world = copy_world(self.env, *more, emptied=emptied)
@@ -267,8 +270,8 @@ class EpisodeSource:
         elif kind == "clear":
             lane.rebuild(emptied=True)
         elif kind == "world":
-            given = self._given_worlds.get(request.name)
-            lane.restart(lane.seed, given or load_worlds(request.name))
+            world = self._given_worlds.get(request.name)
+            lane.restart(lane.seed, world or load_worlds(request.name))
         elif kind == "policy":
             for lane in self.lanes:
                 lane.rebuild(request.name)
@@ -286,7 +289,7 @@ class EpisodeSource:
         )
 
     def _drive(self, request: Request) -> None:
-        """Converts fractions of the maximum speeds forward, left, and turning left to a command."""
+        """Begins or ends driving by hand, with fractions of the maximum speeds as the command."""
         robot = self.model.robot
         if not self._drives:
             raise ConfigError(

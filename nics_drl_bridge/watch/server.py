@@ -213,9 +213,7 @@ class PageServer:
         except ValidationError as error:
             first = error.errors()[0]
             place = ".".join(map(str, first["loc"])) or "JSON"
-            self.tell(
-                f"a request of the page is not understood: {place}: {first['msg']}."
-            )
+            self.tell(f"the page sent an invalid request: {place}: {first['msg']}.")
 
     def _send(self, page: Any) -> None:
         from websockets.exceptions import ConnectionClosed

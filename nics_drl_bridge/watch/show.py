@@ -99,7 +99,7 @@ def show(
     server: PageServer,
     is_over: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Shows a source until the server is closed, or `is_over` says so before a frame."""
+    """Shows a source until the server is closed, or `is_over` returns True before a frame."""
     pace = Tempo()
     shown_s = 0.0
 

@@ -1,7 +1,7 @@
 """Shows some worlds of a training from time to time, at no cost while no page is open."""
 
 import time
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
@@ -17,6 +17,17 @@ class Envs(Protocol):
     envs: tuple[BridgeVectorEnv, ...]
 
 
+class _ShownWorld(NamedTuple):
+    """A world that is shown."""
+
+    env: BridgeVectorEnv
+    row: int  # its index in the vector env
+    first_member: (
+        int  # index in `Stage.worlds` of the first member of the env's world set
+    )
+    track: Track
+
+
 class TrainingView:
     """Shows the first worlds of each vector env; call it after each step of all envs."""
 
@@ -25,8 +36,8 @@ class TrainingView:
         envs = training.envs
         worlds_per_env = max(1, MOST_WORLDS // len(envs))
         sizes = [len(env.world.members) for env in envs]
-        self._worlds = [  # each with the index of the first member of its world set
-            (env, n, sum(sizes[:k]), Track())
+        self._worlds = [
+            _ShownWorld(env, n, sum(sizes[:k]), Track())
             for k, env in enumerate(envs[:MOST_WORLDS])
             for n in range(min(worlds_per_env, env.num_envs))
         ]
@@ -45,8 +56,9 @@ class TrainingView:
             return
         now = time.monotonic()
         due = now - self._shown_s >= PERIOD_S
-        for env, n, _, trail in self._worlds:
-            trail.add(env.simulator.data.pose[n], int(env.simulator.data.steps[n]))
+        for world in self._worlds:
+            data = world.env.simulator.data
+            world.track.add(data.pose[world.row], int(data.steps[world.row]))
         if not due:
             return
         if self._measured == self._steps - 1:
@@ -59,11 +71,12 @@ class TrainingView:
 
     def _make_frame(self) -> Frame:
         worlds = []
-        for env, n, first, trail in self._worlds:
-            shot = env.snapshot(n)
-            name = f"{env.world.name} {n}"
-            time_s = shot.step * env.model.control_period
-            place = first + shot.member
-            worlds.append(WorldFrame(shot, name, place, trail.paths, time_s=time_s))
-        period_s = self._worlds[0][0].model.control_period
+        for world in self._worlds:
+            shot = world.env.snapshot(world.row)
+            name = f"{world.env.world.name} {world.row}"
+            time_s = shot.step * world.env.model.control_period
+            place = world.first_member + shot.member
+            paths = world.track.paths
+            worlds.append(WorldFrame(shot, name, place, paths, time_s=time_s))
+        period_s = self._worlds[0].env.model.control_period
         return Frame(self._steps * period_s, tuple(worlds), self.note)

@@ -76,7 +76,7 @@ MISTAKES = {
     f"train --seeds {2**64}": "seed 18446744073709551616: must be",
     f"evaluate straight --in fast --seed {2**63}": "seed|'--seed'",
     "train --out mine.py": "--out mine.py: is a file, not a folder",
-    "train --watch --engine ray": "worlds of other processes are not shown",
+    "train --watch --engine ray": "worlds in other processes can't be shown",
     "record --out d.npz --preview --remap odom=x": "--remap 'odom=x': must be NAME:=OTHER",
     "demo --recording empty --out d": "empty",
     "watch --ros --bag drive": "--bag can't be combined with --ros; remove --bag or --ros",

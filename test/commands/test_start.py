@@ -23,6 +23,7 @@ def handled():
     before = signal.signal(signal.SIGINT, interrupts._end)
     yield
     signal.signal(signal.SIGINT, before)
+    interrupts._interrupts.clear()
 
 
 def test_ctrl_c_in_a_callback_of_llvm_comes_when_that_is_over(handled):

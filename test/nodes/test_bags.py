@@ -125,7 +125,7 @@ def test_a_recorder_flushes_and_tells_where_the_bag_lies_once_the_storage_is_ful
     (left,) = tmp_path.glob(".drive.*/drive")
     (told,) = (line for line in err.splitlines() if "drive" in line)
     assert told.startswith(f"nics: {place}: ")
-    assert f"what was written until then lies in {left}" in told
+    assert f"the data written so far are in {left}" in told
     assert bags.unfinished_messages(left) > 10
 
 

@@ -130,7 +130,7 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
         ),
         (
             ["--address", "auto"],
-            "--address: belongs to --engine ray; add that, or leave it out.",
+            "--address: requires --engine ray; add it, or remove this option.",
         ),
     ],
 )

@@ -83,7 +83,7 @@ def test_an_error_of_the_storage_of_any_type_keeps_what_was_recorded(
 
     monkeypatch.setattr(Writer, method, fail)
     reason = getattr(fault, "strerror", fault)
-    said = f"drive: {reason}; what was written until then lies"
+    said = f"drive: {reason}; the data written so far are in"
     with pytest.raises(RecordingError, match=said) as caught:
         record(tmp_path / "drive", storage, 60)
     assert str(caught.value).count(f"{tmp_path / 'drive'}: ") == 1
@@ -123,9 +123,7 @@ def test_a_bag_whose_place_was_taken_meanwhile_is_kept(tmp_path, monkeypatch):
         finish(unfinished, path, storage)
 
     monkeypatch.setattr(write, "_finish", taken)
-    with pytest.raises(
-        RecordingError, match=r"was made meanwhile.* lies in"
-    ) as refused:
+    with pytest.raises(RecordingError, match=r"was made meanwhile.* are in") as refused:
         record(tmp_path / "drive", "mcap", 12)
     (left,) = tmp_path.glob(".drive.*/drive")
     assert str(left) in str(refused.value)

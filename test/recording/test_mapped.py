@@ -219,16 +219,16 @@ WRONG = """
 time: null -> `time: t`
 time: ms -> `time: {from: ms, unit: ms}`
 time: still -> all of its stamps are 0 s
-time: short -> `unit:` of its `time:`
+time: short -> add `unit:` to its `time:`
 time: sec -> `time: [sec, nanosec]`
-{time: sec, in: log.csv} -> of 50 rows each
+{time: sec, in: log.csv} -> with 50 rows each
 command: {v: vv} -> did you mean 'v'?
 command: {v: "other.csv:v"} -> has no 'other.csv'
 command: {v: {from: v, time: later}} -> separate `clock:`
 command: {v: {from: v, when: {w: 7}}} -> w is 7.0
 command: {v: {from: count, unit: rpm}} -> {from: count, unit: ticks,
 command: {v: back} -> {from: back, unit: ticks,
-command: {v: {from: back, unit: m/s}} -> went on by 7960
+command: {v: {from: back, unit: m/s}} -> grew by 7960
 command: {v: lat} -> 'lat' looks like a latitude or longitude, which was
 command: {v: 6} -> 'cov_xx' shows how uncertain a measurement is
 command: {v: {from: noisy, unit: ticks}} -> `unit: ticks/s`
@@ -256,7 +256,7 @@ pose: {x: 1, y: 2} -> either heading or quaternion
 pose: {x: 1, y: 2, heading: 3, unit: ms} -> one of m, dm
 command: {v: {from: 1, unit: kmph}} -> mean 'mph'?
 pose: {x: 1, y: 2, heading: 3, covariance: [1, 2]} -> 3, 9 or 36
-command: -> command: names none, but
+command: -> command: is empty, but
 command: {v: "/fix:longitude"} -> shows where the robot was, and was not
 """
 

@@ -102,7 +102,7 @@ def test_without_poses_the_topics_are_listed_with_their_types():
 def test_an_empty_topic_plays_no_role():
     sentence = refused(USUAL, empty=("/cmd_vel",))
     assert "record one of type geometry_msgs/msg/Twist, " in sentence
-    assert "which `nics inspect BAG --map my.yaml` begins" in sentence
+    assert "which `nics inspect BAG --map my.yaml` drafts" in sentence
     assert "no topic is known to hold the commands" in sentence
     assert "/cmd_vel (geometry_msgs/msg/Twist, empty)" in sentence
     sentence = refused(USUAL, empty=("/cmd_vel",), cmd_vel="/cmd_vel")

@@ -262,11 +262,11 @@ def test_a_scan_that_does_not_fit_is_named(changed, check, said):
         ("odom", {"covariance": 0.0}, "odometry", "covariance of zeros"),
         ("odom", {"jump": 3.0}, "odometry", "jumps 1 times, by up to 3.0"),
         ("odom", {"stamped": False}, "stamp", "300 of 300 messages are not stamped"),
-        ("cmd_vel", {"turn": -0.2}, "command", "turns against its commands"),
+        ("cmd_vel", {"turn": -0.2}, "command", "turns opposite to its commands"),
         ("scan", {"step": 2.0 / LIDAR.rate}, "rate", f"expected {LIDAR.rate:.3g} Hz"),
         ("imu", {"rate": 0.25 / 1.6}, "gyro", "contradicts odometry by 0."),
         ("imu", {"rate": 0.25 / 1.6, "seconds": 5.0}, "gyro", "imu:=TOPIC"),
-        ("imu", {"rate": -0.25}, "gyro", "against odometry"),
+        ("imu", {"rate": -0.25}, "gyro", "opposite to odometry"),
         ("imu", {"rate": 45.0 / np.pi}, "gyro", "degrees per second"),
     ],
 )

@@ -114,7 +114,7 @@ def test_requests_arrive_and_nonsense_is_told_in_a_sentence(server):
             "[]",
         ):
             client.socket.send(nonsense)
-            assert "is not understood" in client.next("notice")["text"]
+            assert "the page sent an invalid request" in client.next("notice")["text"]
         assert server.request(0.0) is None
     until(lambda: not server.watched, "the end of the page")
 

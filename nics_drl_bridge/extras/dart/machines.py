@@ -129,9 +129,9 @@ def _read_skeleton(path: Path) -> Any:
     try:
         skeleton = reader(uri)
     except RuntimeError as error:
-        raise ConfigError(f"robot {str(path)!r}: {error}; mend the file.") from None
+        raise ConfigError(f"robot {str(path)!r}: {error}; correct the file.") from None
     if skeleton is None:
-        raise ConfigError(f"robot {str(path)!r}: DART can't read it; mend the file.")
+        raise ConfigError(f"robot {str(path)!r}: DART can't read it; correct the file.")
     if not skeleton.getNumBodyNodes() or skeleton.getRootJoint().getNumDofs() != 6:
         fault = "its first link is fixed to the world, or it has none"
         raise ConfigError(f"robot {str(path)!r}: {fault}; give it a free base.")
@@ -175,7 +175,7 @@ def _require_one(
     if len(fitting) != 1:
         there = ", ".join(hinge.joint.getName() for hinge in hinges) or "none"
         raise ConfigError(
-            f"robot {str(path)!r}: needs one joint as {name!r}, not {len(fitting)}; "
+            f"robot {str(path)!r}: {len(fitting)} joints could be {name!r}, where one is needed; "
             f"it has {there}."
         )
 

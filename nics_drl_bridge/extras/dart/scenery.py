@@ -73,7 +73,7 @@ def place_body(body: Any, pose: Array, height: float = 0.0) -> None:
 
 
 def add_shape(body: Any, shape: Any, transform: Any = None) -> Any:
-    """Adds a shape that rays can hit but nothing touches to a body; returns its node."""
+    """Adds a shape to a body that rays hit but that does not collide; returns its node."""
     node = body.createShapeNode(shape)
     if transform is not None:
         node.setRelativeTransform(transform)

@@ -190,7 +190,7 @@ class DartSimulator(RayCastingSimulator):
             scenery.forbid_contact(self._engine, bases, [floor])
         self._groups = []
         for bumper in bumpers:
-            others = [one for one in bumpers if one is not bumper]
+            others = [other for other in bumpers if other is not bumper]
             self._groups.append(scenery.make_group(sum(others, seen)))
         return rigs
 

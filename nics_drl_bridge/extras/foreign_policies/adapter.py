@@ -134,11 +134,15 @@ class Adapter:
             first += size
         return past if past and past["begun"][0] > 0.0 else {}
 
-    def _step(self, seen: Array, past: Entries) -> tuple[Array, Entries]:
-        """Returns the command (C,), and what the next step may use; `past` is {} at first."""
+    def _step(self, observation: Array, past: Entries) -> tuple[Array, Entries]:
+        """Returns the command (C,) and all entries of this step.
+
+        `past` contains the kept entries of the previous step; it is empty at first.
+        """
         following: Entries = {"begun": np.ones(1)}
         feeds = {
-            name: self._feed(name, seen, past, following) for name in self._empty_inputs
+            name: self._feed(name, observation, past, following)
+            for name in self._empty_inputs
         }
         outputs = self._run_network(feeds)
         for name, state in self._mapping.states.items():
@@ -148,7 +152,7 @@ class Adapter:
         return self._compute_command(outputs, following), following
 
     def _list_kept(self) -> list[str]:
-        """Returns the names of what a step uses of the one before."""
+        """Returns the names of the entries that a step needs from the previous step."""
         kept = [f"state {name}" for name in self._mapping.states]
         for name, mapped in self._mapping.inputs.items():
             for k, part in enumerate(mapped.parts):
@@ -202,7 +206,7 @@ class Adapter:
                 )
 
     def _list_used_outputs(self) -> Iterator[tuple[str, str]]:
-        """Yields each output that the mapping names, after the place where it does."""
+        """Yields places in the mapping that name an output, each with the output's name."""
         mapping = self._mapping
         for key, command in mapping.outputs.items():
             if command.of is not None:
@@ -255,7 +259,7 @@ class Adapter:
             raise self._make_error(place, reason)
 
     def _check_commands(self) -> tuple[str, ...]:
-        """Returns the names of the commands: of a twist, or the robot's own."""
+        """Checks the commands; returns their names: `TWIST` or the robot's own."""
         outputs = self._mapping.outputs
         choices = self._mapping.choices
         if choices is not None:
@@ -267,8 +271,8 @@ class Adapter:
                 )
                 raise self._make_error("choices.commands", reason)
             named = {name for row in choices.commands for name in row}
-            return self._check_names_of(named, "choices")
-        names = self._check_names_of(outputs, "outputs")
+            return self._choose_command_names(named, "choices")
+        names = self._choose_command_names(outputs, "outputs")
         needed = ("forward", "turn") if names == TWIST else names
         for name in needed:
             if name not in outputs:
@@ -288,7 +292,10 @@ class Adapter:
                 raise self._make_error(f"outputs.{name}.index", reason)
         return names
 
-    def _check_names_of(self, named: Iterable[str], place: str) -> tuple[str, ...]:
+    def _choose_command_names(
+        self, named: Iterable[str], place: str
+    ) -> tuple[str, ...]:
+        """Returns `TWIST` if it contains all names, else the robot's own, which then must."""
         robot = self._robot
         commands = tuple(command.name for command in robot.command)
         if all(name in TWIST for name in named):
@@ -313,13 +320,15 @@ class Adapter:
     # Inputs.
 
     def _feed(
-        self, name: str, seen: Array, past: Entries, following: Entries
+        self, name: str, observation: Array, past: Entries, following: Entries
     ) -> AnyArray:
         empty = self._empty_inputs[name]
         mapped = self._mapping.inputs.get(name)
         if mapped is not None:
             rows = [
-                self._read_part(f"history {name} {k}", part, seen, past, following)
+                self._read_part(
+                    f"history {name} {k}", part, observation, past, following
+                )
                 for k, part in enumerate(mapped.parts)
             ]
             values = scale(np.concatenate(rows), mapped)
@@ -332,11 +341,11 @@ class Adapter:
         self,
         key: str,
         part: InputPart,
-        seen: Array,
+        observation: Array,
         past: Entries,
         following: Entries,
     ) -> Array:
-        row = scale(self._read_quantity(part, seen, past), part)
+        row = scale(self._read_quantity(part, observation, past), part)
         if part.history == 1:
             return row
         earlier = past.get(key, np.tile(row, part.history - 1))
@@ -346,10 +355,12 @@ class Adapter:
             rows = rows.reshape(part.history, -1)[::-1].ravel()
         return rows
 
-    def _read_quantity(self, part: InputPart, seen: Array, past: Entries) -> Array:
+    def _read_quantity(
+        self, part: InputPart, observation: Array, past: Entries
+    ) -> Array:
         """Returns a quantity (K,) in SI units."""
-        scan = seen[: self._scan_parts] * self._range_max
-        distance, cosine, sine, *velocity = seen[self._scan_parts :]
+        scan = observation[: self._scan_parts] * self._range_max
+        distance, cosine, sine, *velocity = observation[self._scan_parts :]
         if part.of == "scan":
             return scan[::-1] if part.clockwise else scan
         if part.of == "constant":

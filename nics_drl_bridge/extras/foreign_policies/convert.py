@@ -77,7 +77,7 @@ def import_policy(source: str | Path, model: SimulatorModel | None = None) -> by
 
 
 def _join(mapping: ForeignPolicy, bundle: leapp_import.Bundle) -> ForeignNetwork:
-    """Adds what a bundle says about its states to a mapping, which has the last word."""
+    """Adds the states of a bundle to a mapping, whose own entries take precedence."""
     states = {**bundle.states, **mapping.states}
     mapping = mapping.model_copy(update={"states": states})
     return ForeignNetwork(mapping, bundle.network, bundle.path, bundle.sha256)

@@ -198,8 +198,8 @@ def restore_policy(model: Any) -> bytes | None:
     joins = [k for k, node in enumerate(graph.node) if onnx_graph.INPUT in node.output]
     if joins:
         del graph.node[: joins[0] + 1]
-    weights = [each for each in graph.initializer if not each.name.startswith(OURS)]
-    states = [each for each in graph.input if each.name == onnx_graph.STATE_IN]
+    weights = [w for w in graph.initializer if not w.name.startswith(OURS)]
+    states = [end for end in graph.input if end.name == onnx_graph.STATE_IN]
     _replace_all(graph.initializer, weights)
     _replace_all(graph.input, [observation, *states])
     return bytes(ours.SerializeToString(deterministic=True))

@@ -33,7 +33,7 @@ GOAL = {
     f"goal.{name}": f"goal.{name}"
     for name in ("distance", "bearing", "cosine", "sine", "x", "y")
 }
-SEEN = {  # kind -> name of an element -> quantity; unnamed elements are in this order
+INPUT_MEANINGS = {  # kind -> name of an element -> quantity; unnamed elements are in this order
     "state/body/linear_velocity": LINEAR,
     "state/body/angular_velocity": ANGULAR,
     "state/body/velocity": BOTH,
@@ -41,7 +41,7 @@ SEEN = {  # kind -> name of an element -> quantity; unnamed elements are in this
     "command/goal": GOAL,
     "command/body/pose": {"x": "goal.x", "y": "goal.y", "z": ZERO},
 }
-DONE = {  # the same for outputs
+OUTPUT_MEANINGS = {  # the same for outputs
     "target/body/linear_velocity": LINEAR,
     "target/body/angular_velocity": ANGULAR,
     "target/body/velocity": BOTH,
@@ -186,7 +186,10 @@ def read_bundle(path: Path) -> Bundle:
 
 
 def _name_ends(pipeline: Pipeline) -> dict[str, str]:
-    """Names each external or fed back `node/input` and `node/output`, shortly if unambiguous."""
+    """Returns a name for each external or fed back `node/input` and `node/output`.
+
+    It is without the node if it is unambiguous.
+    """
     ends = set[str]()
     for names_by_node in (pipeline.inputs, pipeline.outputs):
         for node, names in names_by_node.items():
@@ -316,13 +319,14 @@ def derive_mapping(bundle: Bundle, model: SimulatorModel) -> Data:
 
 
 def _derive_parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
+    """Returns the parts of an input; for a scan, also sets the layout in `data`, the mapping."""
     kind = entry.kind or ""
     extra = entry.model_extra or {}
     if kind == BEAMS or (kind == SECTORS and isinstance(extra.get("scan"), dict)):
         data["scan"] = extra.get("scan")
         return [{"of": "scan", "divide": _find_scan_divisor(extra)}]
     size = math.prod(entry.shape) if isinstance(entry.shape, list) else 0
-    meanings = SEEN.get(kind, {})
+    meanings = INPUT_MEANINGS.get(kind, {})
     names = entry.names
     # A pose without names is ambiguous: it may include a heading.
     if not names and len(meanings) == size and "pose" not in kind:
@@ -352,7 +356,8 @@ def _find_scan_divisor(extra: Data) -> float:
 def _add_commands(
     outputs: Data, name: str, entry: Tensor, model: SimulatorModel
 ) -> None:
-    meanings = DONE.get(entry.kind or "", {})
+    """Adds the commands among the elements of an output to a mapping's `outputs`."""
+    meanings = OUTPUT_MEANINGS.get(entry.kind or "", {})
     size = math.prod(entry.shape or [0])
     names = entry.names or (list(meanings) if len(meanings) == size else [])
     commands = {command.name for command in model.robot.command}

@@ -139,7 +139,7 @@ def _write_motor(
     rotor = _compute_rotor(machine, physics)
     mass = physics.mass / _count_driven(machine) + 1.5 * physics.wheel_mass
     inertia = mass * machine.radius**2 + rotor
-    if machine.kind == "ackermann":  # one motor moves the robot, and four wheels
+    if machine.kind == "ackermann":  # one motor drives the robot and all four wheels
         mass = physics.mass + 6.0 * physics.wheel_mass
         inertia = mass * machine.radius**2 + 2.0 * rotor
     lag = machine.lags[0] - servo_lag

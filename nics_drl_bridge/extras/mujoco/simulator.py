@@ -171,7 +171,7 @@ class MujocoSimulator(PhysicsSimulator):
         )
         self._data = mujoco.MjData(compiled)
         self._mocap = {}
-        for k in (each.number for each in obstacles if each.moves):
+        for k in (obstacle.number for obstacle in obstacles if obstacle.moves):
             body = compiled.body(f"{scenery.OBSTACLE_NAME}{k}")
             self._mocap[k] = int(body.mocapid[0])
         self._bumper_of = scenery.find_bumpers(compiled, robots)

@@ -105,7 +105,8 @@ def test_a_file_whose_wheels_do_not_fit_is_refused_by_the_joint(tmp_path):
     three = {name: PLACES[name] for name in ("wheel_a", "wheel_b", "wheel_c")}
     file = write_urdf(tmp_path, three)
     with pytest.raises(
-        ConfigError, match="one joint as 'rear_right', not 0; it has wh"
+        ConfigError,
+        match="0 joints could be 'rear_right', where one is needed; it has wh",
     ):
         DartRobot(load_robot("jackal"), file=file)
     file.write_text("<robot>")
