@@ -138,7 +138,8 @@ def test_a_model_that_loses_to_its_textbook_is_not_written_but_the_textbook(
     assert "the model written is the textbook" in doubts
     (at,) = [at for at in commanded.judgement if at.horizon_s == 5.0]
     assert at.model.position_m < 0.03
-    monkeypatch.setattr(generator, "identify", lambda *_, **__: commanded)
+    identified = "nics_drl_bridge.identify.identify.identify"
+    monkeypatch.setattr(identified, lambda *_, **__: commanded)
     spec = without_wheels()
     model, _ = generator.generate(
         commanded.recording, spec, generator.mount_lidar(spec)
