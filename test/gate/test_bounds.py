@@ -146,6 +146,7 @@ def test_a_gate_that_slept_for_too_long_is_at_fault_until_it_was_awake_as_long(
     [
         ((0.25, 0.0, 0.0625), 0.0, False),
         ((0.2501, 0.0, 0.0), 0.0, True),
+        ((0.0, 0.2501, 0.0), 0.0, True),
         ((0.0, 0.0, 0.0626), 0.0, True),
         ((0.0, 0.0, 0.0), 1.0, False),  # 0.5 m, and 0.5 m at twice the maximum speed
         ((0.0, 0.0, 0.0), 1.001, True),
