@@ -263,9 +263,9 @@ def describe_counter(values: Array) -> str:
     if not (values == np.round(values)).all():
         return ""
     step = np.abs(np.diff(values))
-    growth = float(abs(values[-1] - values[0]))
-    if growth > max(GROWN, ONE_WAY * step.sum()):
-        return f"grew by {growth:.10g}"
+    change = float(abs(values[-1] - values[0]))
+    if change > max(GROWN, ONE_WAY * step.sum()):
+        return f"changed by {change:.10g} in one direction"
     size = find_overflow(values, (1.0,), BITS)
     if size is None:
         return ""

@@ -228,7 +228,7 @@ command: {v: {from: v, time: later}} -> separate `clock:`
 command: {v: {from: v, when: {w: 7}}} -> w is 7.0
 command: {v: {from: count, unit: rpm}} -> {from: count, unit: ticks,
 command: {v: back} -> {from: back, unit: ticks,
-command: {v: {from: back, unit: m/s}} -> grew by 7960
+command: {v: {from: back, unit: m/s}} -> changed by 7960 in one direction, not a speed
 command: {v: lat} -> 'lat' looks like a latitude or longitude, which was
 command: {v: 6} -> 'cov_xx' shows how uncertain a measurement is
 command: {v: {from: noisy, unit: ticks}} -> `unit: ticks/s`
