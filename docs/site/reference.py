@@ -295,16 +295,16 @@ def command_section(path: str, command: Any) -> str:
             usual = shown(
                 one.default if not isinstance(one.default, Path) else str(one.default)
             )
-        told = " ".join((getattr(one, "help", "") or "").split()).replace("|", "&#124;")
+        told = " ".join((getattr(one, "help", "") or "").split())
         lines.append(
-            f"| {', '.join(f'`{name}`' for name in names)} | {usual} | {told} |"
+            f"| {', '.join(f'`{name}`' for name in names)} | {usual} | {cell(told)} |"
         )
     return "\n".join([*lines, ""])
 
 
 def cell(text: str) -> str:
-    """A text as it stands in a table."""
-    return text.replace("|", "&#124;")
+    """A text as it stands in a table; a browser would hide `<robot>`."""
+    return text.replace("|", "&#124;").replace("<", "&lt;")
 
 
 def parameter_row(row: Row) -> str:

@@ -37,6 +37,13 @@ def test_no_key_argument_or_parameter_of_the_reference_is_without_a_meaning():
         )
 
 
+def test_no_browser_takes_a_part_of_a_meaning_for_a_tag():
+    assert "Default: &lt;robot>_model" in reference.pages()["commands.md"]
+    for text in reference.pages().values():
+        rows = [line for line in text.splitlines() if line.startswith("| `")]
+        assert "<" not in re.sub("`[^`]*`", "", "".join(rows))
+
+
 def test_a_key_has_its_type_default_range_and_the_comment_at_its_field():
     schema = World.model_json_schema()
     found = reference.rows(World, schema["properties"], schema["required"])
