@@ -61,6 +61,12 @@ def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Ar
     return np.array([first, *between, last])
 
 
+def warm_up() -> None:
+    """Loads the libraries that `route` uses; a robot may be driving when its first goal comes."""
+    cells = np.array([[FREE, FREE, OCCUPIED]], np.int8)
+    route(GridMap(cells, 1.0), (0.5, 0.5), (1.5, 0.5), 0.0)
+
+
 def _coarsen(grid: GridMap, parts: int) -> GridMap:
     """Returns the map with cells `parts` times as large; each is occupied if any part of it is."""
     rows, columns = grid.cells.shape

@@ -273,6 +273,13 @@ def test_navigate_to_pose_drives_to_a_goal_and_knows_no_trees(driven):
     assert goal.told[0].distance_remaining > goal.told[-1].distance_remaining
 
 
+def test_no_goal_waits_for_the_libraries_of_the_route(monkeypatch, request):
+    loads = []
+    monkeypatch.setattr(follow_path, "warm_up", lambda: loads.append("route"))
+    request.getfixturevalue("driven")
+    assert loads == ["route"]
+
+
 def test_navigate_to_pose_is_left_to_another_node_that_serves_it(driven, logged):
     server = driven.actions._servers[NAVIGATE]
     other = Node("bt_navigator", context=driven.node.context)

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -36,3 +39,24 @@ def test_an_end_off_the_map_is_told(room, name):
     ends = {"start": START, "goal": GOAL, name: (50.0, 0.0)}
     with pytest.raises(ConfigError, match=f"the {name} of the path is off the map"):
         route(room, ends["start"], ends["goal"], RADIUS)
+
+
+LOADED_LATER = """
+import sys
+import numpy as np
+from nics_drl_bridge.lidar.maps import GridMap
+from nics_drl_bridge.policy.route import route, warm_up
+warm_up()
+loaded = set(sys.modules)
+cells = np.zeros((30, 30), np.int8)
+cells[10:20, 15] = 100
+route(GridMap(cells, 0.1), (0.5, 1.5), (2.5, 1.5), 0.2)
+print(sorted(set(sys.modules) - loaded))
+"""
+
+
+def test_a_route_loads_nothing_after_the_warm_up():
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED_LATER], capture_output=True, text=True
+    )
+    assert done.stdout.strip() == "[]", done.stderr

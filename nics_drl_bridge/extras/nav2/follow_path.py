@@ -33,7 +33,7 @@ from nics_drl_bridge.policy.follow import (
     PlannedPath,
     ProgressChecker,
 )
-from nics_drl_bridge.policy.route import route
+from nics_drl_bridge.policy.route import route, warm_up
 from nics_drl_bridge.recording.messages import read_pose
 
 FOLLOW = "follow_path"
@@ -182,6 +182,7 @@ class PathActions:
             return
         self._serve(FOLLOW, self._follow)
         if node.get_parameter(NAVIGATE).value:
+            warm_up()
             self._serve(NAVIGATE, self._navigate)
             timer = runner.call_periodically(node, LOOK_S, self._look)
             self._undo.append(partial(node.destroy_timer, timer))
