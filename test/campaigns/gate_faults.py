@@ -30,6 +30,7 @@ from nics_drl_bridge.nodes.gate_faults import FAULTS, LATE_S, Setup, inject_all
 ROBOT = "ackermann"
 TWIST = np.array([0.5, 0.0, 0.1])
 MEDIAN_S = 0.30
+MEDIAN_OF = 5  # the median of fewer injections is chance
 SHORT_PATIENCE_S = 8.0
 # ten times the gate's own [s]
 AGES = {"scan_age": 3.0, "odom_age": 3.0, "command_age": 3.0, "e_stop_silence": 2.5}
@@ -53,7 +54,7 @@ def set_bars(result: Result) -> Bars:
             "max_s": at_most(figures["limit_s"], "time to zero [s]"),
             "unsafe_commands": at_most(0),
         }
-        if figures["limit_s"] == LATE_S:
+        if figures["limit_s"] == LATE_S and figures["asked"] >= MEDIAN_OF:
             bars[name]["p50_s"] = at_most(MEDIAN_S, "median time to zero [s]")
     return bars
 

@@ -188,7 +188,7 @@ def test_a_task_that_tells_no_success_is_said_to(tmp_path, monkeypatch):
     own = "--task", "mine.py:Reach"
     done = nics("--settings", "settings.yaml", *own, "--episodes", 2, "--out", "run")
     assert done.exit_code == 0, done.output
-    assert "does the task's `info` contain `is_success`?" in done.output
+    assert "check that the task's `info` contains `is_success`" in done.output
     assert "--task mine.py:Reach" in done.output.splitlines()[-1]
 
 
