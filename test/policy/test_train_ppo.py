@@ -241,6 +241,16 @@ def test_a_saved_index_outside_the_discrete_actions_is_refused(index):
         lean.restore(state)
 
 
+def test_saved_actions_of_too_few_commands_are_refused():
+    lean, _ = pair()
+    lean.collector.last_observations = lean.collector.worlds.reset()
+    rollout, _ = lean.collector.collect()
+    state = lean.state()
+    state["rollout"] = rollout._replace(actions=rollout.actions[..., :1])._asdict()
+    with pytest.raises(ValueError, match="the actions are of shape"):
+        lean.restore(state)
+
+
 def test_a_rollout_is_that_of_stable_baselines3_over_ends_of_episodes_and_time_limits():
     lean, theirs = pair(
         log_std=-30.0

@@ -223,8 +223,8 @@ class LeanPpo:
         _restore_array(normaliser.std, state["normaliser"]["std"])
         self.steps = state["steps"]
         rollout = state["rollout"]
-        if rollout and self.networks.is_discrete:
-            _check_indices(rollout["actions"], self.networks.actor.widths[-1])
+        if rollout:
+            self._check_actions(rollout["actions"])
         self._rollout = rollout and Rollout(**rollout)
         self._successes.extend(state["recent"])
         _restore_array(self.collector.last_observations, state["last"])
@@ -232,18 +232,24 @@ class LeanPpo:
         self.collector.rng.bit_generator.state = collecting
         self.learner.rng.bit_generator.state = learning
 
+    def _check_actions(self, actions: AnyArray) -> None:
+        """Raises ValueError unless saved actions have the shape and the indices of this training.
+
+        The compiled gradients index memory by them without a check.
+        """
+        count = self.networks.actor.widths[-1]
+        shape: tuple[int, ...] = (self.collector.steps, self.collector.worlds.num_envs)
+        if not self.networks.is_discrete:
+            shape = (*shape, count)
+        if actions.shape != shape:
+            raise ValueError(f"the actions are of shape {actions.shape}, not {shape}")
+        is_index = (actions >= 0) & (actions < count)
+        if self.networks.is_discrete and not is_index.all():
+            raise ValueError(f"the index of an action is not from 0 to {count - 1}")
+
 
 def _restore_array(target: AnyArray, saved: AnyArray) -> None:
     """Copies a saved array. Raises ValueError unless it has the target's type and shape."""
     if saved.dtype != target.dtype or saved.shape != target.shape:
         raise ValueError(f"an array is {saved.dtype} of shape {saved.shape}")
     target[:] = saved
-
-
-def _check_indices(actions: AnyArray, count: int) -> None:
-    """Raises ValueError unless all indices of discrete actions are below `count`.
-
-    The compiled gradients index memory by them without a check.
-    """
-    if not ((actions >= 0) & (actions < count)).all():
-        raise ValueError(f"the index of an action is not from 0 to {count - 1}")
