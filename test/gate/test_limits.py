@@ -30,15 +30,17 @@ TOLERANCE = 1e-6
 WISH = st.floats(-3.0, 3.0)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("robot", ["differential", "mecanum"])
-def test_speeds_are_scaled_by_one_factor_so_that_the_curvature_stays(robot):
-    limits = LIMITS[robot]
+def test_speeds_are_scaled_by_one_factor_so_that_the_curvature_stays(robot, sign):
+    limits = replace(LIMITS[robot], low=-0.5 * LIMITS[robot].high)
     command = (
         np.array([0.9, 3.0]) if robot == "differential" else np.array([1.4, -0.7, 1.0])
     )
-    out = saturate(command, limits)
+    out = saturate(sign * command, limits)
     assert out / out[0] == pytest.approx(command / command[0])
-    assert (np.abs(out) / limits.high).max() == pytest.approx(1.0)
+    bounds = np.where(out > 0.0, limits.high, limits.low)
+    assert (out / bounds).max() == pytest.approx(1.0)
 
 
 def test_what_a_robot_can_not_do_at_all_is_dropped_and_the_rest_stays():

@@ -360,3 +360,17 @@ def test_the_turns_and_the_motions_that_are_tried_are_close_to_each_other(turn):
     assert (turns.min(), turns.max()) == pytest.approx((0.0, 1.3))
     lesser = evidence._lessen_motion(np.array([0.49, 0.0, 0.0]))[:, 0]
     assert lesser == pytest.approx(0.049 * np.arange(10))
+
+
+def test_among_turns_that_fit_equally_well_the_one_closest_to_odometrys_is_taken():
+    """What is around repeats itself every 24 beams, so standing still fits, too."""
+    rng = np.random.default_rng(0)
+    part = rng.uniform(1.0, 3.0, 24).astype(np.float32)
+    ranges = np.tile(part, LIDAR.beams // 24)
+    turn = 24 * LIDAR.angle_increment
+    tried = evidence._vary_turn(np.array([0.0, 0.0, turn / 0.7]))[:, 2]
+    fraction = tried[np.abs(tried - turn).argmin()] / (turn / 0.7)
+    old = View(0, np.zeros(3), ranges)
+    new = View(NS_PER_S // 10, np.array([0.0, 0.0, turn / fraction]), ranges)
+    motion = estimate_motion(old, new, get_beams(GIVEN), Tolerance(0.03, 0.0))
+    assert motion == pytest.approx([0.0, 0.0, turn])

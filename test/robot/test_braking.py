@@ -15,10 +15,12 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.robot.braking import (
+    SLACK_M,
     Braking,
     Drift,
     TurnBraking,
     _find_min_fraction,
+    _fit_tightest,
     derive_slowest_model,
     find_braking,
     find_lowest_line,
@@ -359,3 +361,17 @@ def test_the_lowest_line_above_points_is_that_of_a_linear_program(seed):
     assert min(intercept, slope) >= 0.0
     assert (intercept + slope * x >= y - 1e-12).all()
     assert intercept + slope * at == pytest.approx(best.fun, abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_bound_on_stops_has_the_least_mean_excess(seed):
+    rng = np.random.default_rng(seed)
+    speed = rng.uniform(0.1, 2.0, 30)
+    pace = speed * rng.uniform(0.5, 1.5, 30)
+    distance = speed * (0.2 + 0.4 * pace) * rng.uniform(0.3, 1.0, 30)
+    fit = _fit_tightest(speed, pace, distance)
+    bound = np.stack([speed, speed * pace], axis=1)
+    weight = 1.0 / (distance + SLACK_M) / 30
+    best = linprog(weight @ bound, -bound, -distance, bounds=(0.0, None))
+    assert (fit.reaction_s, fit.inverse) == pytest.approx(tuple(best.x), abs=1e-7)
+    assert fit.slack == pytest.approx(best.fun - weight @ distance)
