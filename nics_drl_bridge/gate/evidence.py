@@ -190,8 +190,8 @@ def _lessen_motion(motion: Array) -> Array:
 
 def _count_sectors(beams: NDArray[np.intp], lidar: MountedBeams) -> int:
     """Returns the number of sectors around the lidar that contain enough of the beams (n,)."""
-    bearings = np.mod(lidar.first + beams * lidar.step, FULL_CIRCLE)
-    sectors = (bearings / FULL_CIRCLE * SECTORS).astype(np.intp) % SECTORS
+    bearings = lidar.first + beams * lidar.step
+    sectors = np.floor(bearings / FULL_CIRCLE * SECTORS).astype(np.intp) % SECTORS
     counts = np.bincount(sectors, minlength=SECTORS)
     return int(np.count_nonzero(counts >= MIN_SECTOR_BEAMS))
 

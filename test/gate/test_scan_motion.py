@@ -374,3 +374,16 @@ def test_a_contradiction_lasts_until_a_scan_agrees_or_it_is_forgotten(
     since_ns = None if since_s is None else round(since_s * NS_PER_S)
     verdict = Verdict(share, held)
     assert scan_motion._update_held_since(before_ns, verdict, 9 * NS_PER_S) == since_ns
+
+
+@pytest.mark.parametrize(
+    ("size", "first", "step"), [(12, 0.0, 1.0), (6, 1.0, 2.0), (4, 1.0, 3.0)]
+)
+def test_a_direction_is_that_of_the_middle_of_its_beams(size, first, step):
+    angles = np.deg2rad(np.arange(12.0) - 6.0)
+    directions = scan_motion.make_directions(
+        config(beam_angles=angles), size, half_window=0
+    )
+    assert directions.first == pytest.approx(angles[0] + np.deg2rad(first))
+    assert directions.step == pytest.approx(np.deg2rad(step))
+    assert not directions.full_circle

@@ -147,6 +147,18 @@ def test_an_unknown_beam_shows_no_free_ground_now_or_before(unknown):
     assert entered[20] == (not unknown)
 
 
+def test_what_ends_beside_the_view_of_the_old_scan_did_not_enter_it():
+    """The robot has turned around; what lies in memory behind the old scan is far away."""
+    lidar = MountedBeams(np.deg2rad(-20.0), np.deg2rad(1.0), 0.0, 0.0, 0.0)
+    behind = np.full(400, 9.0, np.float32)
+    old = behind[:41]
+    new = np.full(41, 1.0, np.float32)
+    entered = np.zeros(41, np.bool_)
+    tolerance = Tolerance(0.03, 0.0)
+    mark_entered(entered, new, old, lidar, np.array([0.0, 0.0, np.pi]), 10.0, tolerance)
+    assert not entered.any()
+
+
 @pytest.mark.parametrize("step", [np.pi / 180, -np.pi / 180])
 @pytest.mark.parametrize("heading", [0.0, 2.5, -2.5])
 def test_a_point_belongs_to_the_beam_towards_it_whatever_the_mount(step, heading):

@@ -23,7 +23,7 @@ FAILED: dict[str, Callable[[Row], bool]] = {
 }
 
 
-def summarise(rows: Sequence[Row], faults: int = 0) -> dict[str, Any]:
+def summarise(rows: Sequence[Row], faults: int) -> dict[str, Any]:
     """Returns the results of a run's rows as plain data; `faults` of them should be faults."""
     tried = [row for row in rows if row["gated"]]
     controls = [row for row in rows if not row["gated"]]

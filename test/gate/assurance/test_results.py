@@ -28,7 +28,7 @@ def test_failures_of_one_kind_at_one_place_are_one_cluster_with_all_its_seeds():
 
 def test_a_control_counts_for_itself_and_a_claim_without_trials_is_not_tested():
     rows = [row(1), row(1, gated=False, contact=True), row(2, walked_into=True)]
-    results = summarise(rows)
+    results = summarise(rows, faults=0)
     assert results["claims"][TOUCHES]["failures"] == 0
     assert results["claims"][TOUCHES]["trials"] == results["episodes"] == 2
     assert results["control"][TOUCHES]["failures"] == 1
@@ -40,7 +40,9 @@ def test_a_control_counts_for_itself_and_a_claim_without_trials_is_not_tested():
 
 
 def test_in_a_run_that_is_a_control_its_failures_are_kept():
-    results = summarise([row(1, gated=False, contact=True), row(2, gated=False)])
+    results = summarise(
+        [row(1, gated=False, contact=True), row(2, gated=False)], faults=0
+    )
     assert [failed["seed"] for failed in results["failures"]] == [1]
 
 
