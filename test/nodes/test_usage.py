@@ -15,6 +15,13 @@ from nics_drl_bridge.nodes import start
 start.start(sys.argv[1], sys.argv[1:])
 """
 
+COLLECTS = """
+import gc
+from nics_drl_bridge.nodes import start
+start._load_main = lambda node: lambda args: print(gc.isenabled(), gc.get_freeze_count() > 0)
+start.start("policy_node", ["policy_node"])
+"""
+
 
 def run(*words):
     return subprocess.run(
@@ -72,3 +79,12 @@ def test_the_first_word_that_is_not_for_ros_is_named(words, wrong):
         f"policy_node: there is no argument {wrong};" if wrong else ""
     )
     assert bool(sentence) == bool(wrong)
+
+
+@pytest.mark.process
+def test_a_node_collects_garbage_except_for_what_was_loaded(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
+    done = subprocess.run(
+        [sys.executable, "-c", COLLECTS], capture_output=True, text=True, timeout=100
+    )
+    assert (done.returncode, done.stdout) == (0, "True True\n"), done.stderr
