@@ -32,7 +32,7 @@ NAN = float("nan")
 @pytest.mark.parametrize(
     "change",
     [
-        {"n": 1},
+        {"n": 4},
         {"unsafe_commands": 1},
         {"p50_s": 0.31},
         {"p50_s": NAN},
@@ -44,14 +44,15 @@ NAN = float("nan")
 def test_a_fault_that_is_late_unsafe_or_not_measured_misses_one_bar(ros_module, change):
     set_bars = ros_module("gate_faults").set_bars
     good = {
-        "n": 2,
-        "asked": 2,
+        "n": 5,
+        "asked": 5,
         "p50_s": 0.2,
         "max_s": 0.3,
         "limit_s": 0.4,
         "unsafe_commands": 0,
     }
-    for figures, missed in ((good, 0), (good | change, 1)):
+    few = good | {"n": 1, "asked": 1, "p50_s": 0.31}  # no median, but chance
+    for figures, missed in ((good, 0), (few, 0), (good | change, 1)):
         result = {"x": figures}
         assert len(find_missed(result, set_bars(result))) == missed
 
