@@ -20,6 +20,7 @@ from nics_drl_bridge.extras.nav2.nav2_parameters import (
     ControllerParameters,
     choose_plugin,
 )
+from nics_drl_bridge.extras.nav2.route import route, warm_up
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.lidar.maps import GridMap
@@ -33,7 +34,6 @@ from nics_drl_bridge.policy.follow import (
     PlannedPath,
     ProgressChecker,
 )
-from nics_drl_bridge.policy.route import route, warm_up
 from nics_drl_bridge.recording.messages import read_pose
 
 FOLLOW = "follow_path"
