@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.geometry import wrap_angle
+from nics_drl_bridge.geometry import measure_path, wrap_angle
 from nics_drl_bridge.interface import Array
 
 SPACING = 0.05  # distance between the sampled points of a path [m]
@@ -63,7 +63,7 @@ class PlannedPath:
             raise ConfigError(
                 "the path has a coordinate that is not a number, or too large."
             )
-        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+        along = measure_path(poses)
         if along[-1] > LONGEST:
             raise ConfigError(
                 f"the path is {along[-1]:.3g} m long; the maximum is {LONGEST:g} m."
