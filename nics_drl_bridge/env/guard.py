@@ -9,7 +9,6 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.errors import ConfigError
@@ -125,14 +124,3 @@ def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> AnyArra
     elif not space.contains(array):
         raise gymnasium.error.InvalidAction(f"{name} {array!r}: is not in {space}.")
     return array
-
-
-def check_command(command: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Returns a task's command as an array. Raises ConfigError unless finite, of this shape."""
-    made = np.asarray(command, np.float64)
-    if made.shape != shape or not kernels.is_finite(made.reshape(1, -1)):
-        raise ConfigError(
-            f"the task's command {made!r:.80}: must be finite and of shape "
-            f"{shape}; check its `command`."
-        )
-    return made

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.env import guard, kernels
+from nics_drl_bridge.env import kernels
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.interface import Array, RobotView
 from nics_drl_bridge.kernels import Packed, pack
@@ -212,7 +212,7 @@ class Task(ABC):
         command = self.command(actions)
         # Since the limits are finite, only a user's own `command` can return inf.
         if type(self).command is not Task.command or command.shape != shape:
-            command = guard.check_command(command, shape)
+            command = np.asarray(self.check_result("command", command, shape), float)
         if self.robots > 1 and ended.any():
             command = np.where(ended[..., None], still(self.robot), command)
         return command

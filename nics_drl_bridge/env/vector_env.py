@@ -330,19 +330,12 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
     def _describe(self, outcome: Outcome) -> Info:
         """Returns the facts of a step, in arrays of the caller's own."""
         data = self.simulator.data
-
-        def copy_all(values: Facts) -> Facts:
-            return {
-                name: self._drop_robot_axis(rows).copy()
-                for name, rows in values.items()
-            }
-
         return {
             "stamp_ns": data.steps * self._period_ns,
             "true_pose": self._drop_robot_axis(data.pose).copy(),
             "true_collision": self._drop_robot_axis(data.collided).astype(np.bool_),
-            **copy_all(outcome.info),
-            "reward_terms": copy_all(outcome.terms),
+            **self._copy_rows(outcome.info),
+            "reward_terms": self._copy_rows(outcome.terms),
         }
 
     def _advance(
@@ -404,11 +397,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
     # Facts as arrays (N, ...) for worlds with one robot, or (N, M, ...) for teams.
 
     def _get_known(self) -> Info:
-        known = {
-            name: self._drop_robot_axis(self.memory[name]).copy()
-            for name in self.task.shown
-        }
-        known["pose"] = self._drop_robot_axis(self.simulator.data.odom).copy()
+        shown = {name: self.memory[name] for name in self.task.shown}
+        known = self._copy_rows({**shown, "pose": self.simulator.data.odom})
         known["scan_age_s"] = np.zeros(self.num_envs)
         known["odom_age_s"] = np.zeros(self.num_envs)
         return known
@@ -426,6 +416,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         if drawn:
             beginnings["randomisation"] = drawn
         return beginnings
+
+    def _copy_rows(self, values: Facts) -> Facts:
+        return {
+            name: self._drop_robot_axis(rows).copy() for name, rows in values.items()
+        }
 
     def _drop_robot_axis(self, rows: AnyArray) -> AnyArray:
         return rows[:, 0] if self.robots == 1 else rows
@@ -473,15 +468,13 @@ def join_outcomes(parts: Sequence[Outcome]) -> Outcome:
     """Joins the outcomes of consecutive parts of the worlds."""
     if len(parts) == 1:
         return parts[0]
-    terms = {
-        name: np.concatenate([part.terms[name] for part in parts])
-        for name in parts[0].terms
-    }
-    info = {
-        name: np.concatenate([part.info[name] for part in parts])
-        for name in parts[0].info
-    }
-    return Outcome(terms, np.concatenate([part.ended for part in parts]), info)
+    ended = np.concatenate([part.ended for part in parts])
+    terms = _join_facts([part.terms for part in parts])
+    return Outcome(terms, ended, _join_facts([part.info for part in parts]))
+
+
+def _join_facts(parts: Sequence[Facts]) -> Facts:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> AnyArray:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from nics_drl_bridge import defaults
 from nics_drl_bridge.config import parse_yaml, read_text
 from nics_drl_bridge.errors import ConfigError, shorten
+from nics_drl_bridge.nodes.path_checks import GoalCheck, ProgressCheck
 from nics_drl_bridge.nodes.transport import is_before_kilted
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
@@ -107,8 +108,6 @@ def find_frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
 
 def list_checker_rows(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
     """Return the parameters of the named checks; they are those of Nav2's checkers."""
-    from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
-
     rows = []
     for names, check in ((goals, GoalCheck), (progress, ProgressCheck)):
         known: dict[str, Any] = {each.name: each.default for each in fields(check)}

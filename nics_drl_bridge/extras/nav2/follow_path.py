@@ -16,10 +16,17 @@ from rclpy.node import Node, NodeNameNonExistentError
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.nav2.follow import (
+    GoalChecker,
+    Place,
+    PlannedPath,
+    ProgressChecker,
+)
 from nics_drl_bridge.extras.nav2.nav2_parameters import (
     ControllerParameters,
     choose_plugin,
 )
+from nics_drl_bridge.extras.nav2.route import route, warm_up
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.lidar.maps import GridMap
@@ -27,13 +34,6 @@ from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.frames import GoalFrames
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
-from nics_drl_bridge.policy.follow import (
-    GoalChecker,
-    Place,
-    PlannedPath,
-    ProgressChecker,
-)
-from nics_drl_bridge.policy.route import route, warm_up
 from nics_drl_bridge.recording.messages import read_pose
 
 FOLLOW = "follow_path"

@@ -10,8 +10,8 @@ from rclpy.node import Node
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes.parameters import list_checker_rows
+from nics_drl_bridge.nodes.path_checks import GoalCheck, ProgressCheck
 from nics_drl_bridge.nodes.runner import declare_row, declare_rows, get_text
-from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
 
 # Parameters for Nav2's own plugins, or for a control loop; a policy answers scans instead.
 UNUSED = {

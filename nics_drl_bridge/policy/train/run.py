@@ -430,14 +430,15 @@ def _check(
     check_seeds(seeds, GREATEST_SB3_SEED)
     if not seeds or len(set(seeds)) < len(seeds):
         raise ConfigError(f"seeds {list(seeds)}: give one or more, without duplicates.")
-    folders = [out / f"seed_{seed}" for seed in seeds]
-    for folder in folders:
-        if (folder / OLD_CHECKPOINT).is_file():
+    for seed in seeds:
+        old = out / f"seed_{seed}" / OLD_CHECKPOINT
+        if old.is_file():
             raise ConfigError(
-                f"{folder / OLD_CHECKPOINT}: is a checkpoint of an earlier version, which can't "
+                f"{old}: is a checkpoint of an earlier version, which can't "
                 "be resumed; choose another --out, or remove it."
             )
-    begun = any((folder / CHECKPOINT).is_file() for folder in folders)
+    started = seeds_of(out)
+    begun = not set(started).isdisjoint(seeds)
     if begun and not resumed:
         raise ConfigError(
             f"{out}: contains checkpoints of these seeds; add --resume, or choose another --out."
@@ -452,7 +453,6 @@ def _check(
             f"{out}: contains a run with other settings; choose another --out, or remove it."
         )
     if resumed and not begun:
-        started = seeds_of(out)
         fix = f"name one of {started} with --seeds" if started else "leave out --resume"
         raise ConfigError(f"{out}: contains no checkpoint of these seeds; {fix}.")
 

@@ -14,10 +14,10 @@ from nav2_msgs.action import FollowPath
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.action import ActionClient
 
+from nics_drl_bridge.extras.nav2.route import route
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.listener import SpunNode
-from nics_drl_bridge.policy.route import route
 
 DEADLINE_S = 300.0
 # silence after which the simulator, which waits for commands, is told a zero

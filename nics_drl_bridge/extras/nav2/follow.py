@@ -7,36 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.geometry import wrap_angle
+from nics_drl_bridge.geometry import measure_path, wrap_angle
 from nics_drl_bridge.interface import Array
+from nics_drl_bridge.nodes.path_checks import GoalCheck, ProgressCheck
 
 SPACING = 0.05  # distance between the sampled points of a path [m]
 WINDOW = 2.0  # path length ahead that is searched for the nearest point [m]
 FARTHEST = 1e6  # maximum coordinate of a path [m]
 LONGEST = 1e5  # maximum length of a path [m]
-
-
-@dataclass(frozen=True)
-class GoalCheck:
-    """When a path counts as followed; cf. Nav2's SimpleGoalChecker and PositionGoalChecker."""
-
-    xy_goal_tolerance: float = 0.25  # [m]
-    # tolerance of the heading [rad]; ignored for robots that steer
-    yaw_goal_tolerance: float = 0.25
-    # True: a position once reached counts as reached while the robot turns
-    stateful: bool = True
-    # maximum remaining path length [m]
-    path_length_tolerance: float = 1.0
-
-
-@dataclass(frozen=True)
-class ProgressCheck:
-    """When a robot counts as stuck; cf. Nav2's SimpleProgressChecker and PoseProgressChecker."""
-
-    required_movement_radius: float = 0.5  # distance that the robot must move [m]
-    movement_time_allowance: float = 10.0  # time within which it must do so [s]
-    # turn that also counts as progress [rad]
-    required_movement_angle: float = math.inf
 
 
 class Place(NamedTuple):
@@ -63,7 +41,7 @@ class PlannedPath:
             raise ConfigError(
                 "the path has a coordinate that is not a number, or too large."
             )
-        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+        along = measure_path(poses)
         if along[-1] > LONGEST:
             raise ConfigError(
                 f"the path is {along[-1]:.3g} m long; the maximum is {LONGEST:g} m."

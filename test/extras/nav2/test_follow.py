@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.policy.follow import (
-    GoalCheck,
+from nics_drl_bridge.extras.nav2.follow import (
     GoalChecker,
     PlannedPath,
-    ProgressCheck,
     ProgressChecker,
 )
+from nics_drl_bridge.nodes.path_checks import GoalCheck, ProgressCheck
 
 CORNER = np.array([(0.0, 0.0, 0.0), (2.0, 0.0, math.pi / 2), (2.0, 2.0, math.pi)])
 

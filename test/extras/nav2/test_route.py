@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.policy.route import route
+from nics_drl_bridge.extras.nav2.route import route
 from nics_drl_bridge.sim.occupancy import occupancy
 from nics_drl_bridge.sim.world_set import load_worlds
 
@@ -45,7 +45,7 @@ LOADED_LATER = """
 import sys
 import numpy as np
 from nics_drl_bridge.lidar.maps import GridMap
-from nics_drl_bridge.policy.route import route, warm_up
+from nics_drl_bridge.extras.nav2.route import route, warm_up
 warm_up()
 loaded = set(sys.modules)
 cells = np.zeros((30, 30), np.int8)
