@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 
@@ -105,3 +105,25 @@ def test_a_model_that_no_shield_fits_is_refused_before_any_episode():
     single = replace(model, lidar=model.lidar.model_copy(update={"beams": 1}))
     with pytest.raises(ConfigError, match="the shield needs a lidar"):
         runs.Run(PROTOCOL, single)
+
+
+@dataclass
+class Driven:
+    """What an episode came to."""
+
+    contact: bool = False
+
+
+@pytest.mark.parametrize("gated", [True, False])
+def test_a_trial_without_the_gate_is_driven_without_it(monkeypatch, gated):
+    given = []
+
+    def drive(place, config, job, see):
+        given.append(config)
+        return Driven()
+
+    monkeypatch.setattr(runs, "drive", drive)
+    trial = next(each for each in PROTOCOL.list_trials() if each.gated == gated)
+    run = runs.Run(PROTOCOL, builtin_model("differential"))
+    assert run.drive(trial) == {**trial._asdict(), "contact": False, "violations": {}}
+    assert [config is not None for config in given] == [gated]
