@@ -91,7 +91,6 @@ def judge_model(found: Identified, control: str | None, league: bool = False) ->
             predict_kept_twist(drive, chosen), chosen
         )[1],
         "path_m": float(chosen.path.mean()),
-        "windows": len(chosen.start_t),
     }
     told |= {f"coverage_{at.horizon_s:g}": at.coverage for at in found.judgement}
     if league:
