@@ -214,13 +214,13 @@ def test_a_simulation_is_armed_driven_stopped_and_ended_by_nics_alone(start):
         stopped = up.tell("stop")
         assert stopped.returncode == 0, stopped.stderr
         assert "/command_gate has stopped its robot" in stopped.stdout
-        refused = up.tell("arm --wait 2")
+        refused = up.tell("arm --wait 6")
         assert refused.returncode == 1
         assert "refuses to arm" in refused.stderr
         assert "e_stop_released: e_stop_pressed" in refused.stderr
         again = up.tell("arm --reset")
         assert again.returncode == 0, again.stderr
-        nowhere = up.tell("goal 1 0 --frame kitchen --wait 3")
+        nowhere = up.tell("goal 1 0 --frame kitchen --wait 8")
         assert nowhere.returncode == 1
         assert "a goal in the frame 'kitchen' is refused" in nowhere.stderr
     children = up.children
