@@ -199,6 +199,7 @@ setup(
             f"mujoco_node = {PACKAGE}.extras.mujoco.node:main",
         ],
         f"{PACKAGE}.sensors": [f"lidar = {PACKAGE}.lidar.further_lidar:FurtherLidar"],
+        f"{PACKAGE}.trainings": [f"sb3 = {PACKAGE}.extras.sb3.training:Sb3Training"],
         f"{PACKAGE}.viewers": [f"human = {PACKAGE}.watch.human:HumanView"],
     },
 )

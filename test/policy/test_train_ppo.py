@@ -21,7 +21,7 @@ from stable_baselines3.common.buffers import RolloutBuffer  # noqa: E402
 from stable_baselines3.common.callbacks import ConvertCallback  # noqa: E402
 from stable_baselines3.common.logger import Logger  # noqa: E402
 
-from nics_drl_bridge.policy.train.torch_parts import NormaliserLayer  # noqa: E402
+from nics_drl_bridge.extras.sb3.layers import NormaliserLayer  # noqa: E402
 from nics_drl_bridge.policy.train.vec_env import TrainVecEnv  # noqa: E402
 
 # fewer steps in an episode than in a rollout
