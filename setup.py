@@ -182,7 +182,10 @@ setup(
         ],
         # For tools that list environments; gymnasium itself stopped reading this in 1.0.
         "gymnasium.envs": [f"NicsBridge = {PACKAGE}.env.registry:register_envs"],
-        f"{PACKAGE}.adapters": [f"foreign = {PACKAGE}.extras.foreign_policies"],
+        f"{PACKAGE}.adapters": [
+            f"foreign = {PACKAGE}.extras.foreign_policies",
+            f"torch = {PACKAGE}.extras.sb3.export",
+        ],
         f"{PACKAGE}.backends": [
             f"sim = {PACKAGE}.env.sim_backend:SimBackend",
             f"dds = {PACKAGE}.nodes.backends:dds_backend",

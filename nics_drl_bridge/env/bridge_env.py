@@ -1,6 +1,7 @@
 """BridgeEnv: one task over one backend, as a Gymnasium environment."""
 
 from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -230,7 +231,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         free = np.full(shape, np.inf, np.float32)
         sensed = unread(self.model.sensors, 1, self.robots)
         starts = episodes.starts
-        view = RobotView(starts.copy(), 0.0 * starts, free, 0.0, 0.0, 0.0, sensed)
+        view = RobotView(starts.copy(), 0.0 * starts, free, sensed=sensed)
         memory = self.task.start_episodes(episodes)
         with suppress(ConfigError):  # the task may refuse the made-up view
             out = np.empty(self._shape, np.float32)
@@ -331,15 +332,12 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
     def _as_batch(self, view: RobotView) -> RobotView:
         lead = (1, self.robots, -1)
         sensed = {name: reading.reshape(lead) for name, reading in view.sensed.items()}
-        return RobotView(
-            view.pose.reshape(lead),
-            view.twist.reshape(lead),
-            view.ranges.reshape(lead),
-            view.stamp_s,
-            view.scan_age_s,
-            view.odom_age_s,
-            sensed,
-            view.sensed_age_s,
+        return replace(
+            view,
+            pose=view.pose.reshape(lead),
+            twist=view.twist.reshape(lead),
+            ranges=view.ranges.reshape(lead),
+            sensed=sensed,
         )
 
     def _drop_robot_axis(self, rows: AnyArray) -> AnyArray:

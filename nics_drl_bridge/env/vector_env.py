@@ -283,10 +283,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
             data.odom[rows],
             data.twist[rows],
             data.ranges[rows],
-            0.0,
-            0.0,
-            0.0,
-            {name: readings[name][rows] for name in readings},
+            sensed={name: readings[name][rows] for name in readings},
         )
 
     @guard.refuse_after_close
@@ -350,9 +347,6 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
             data.odom[part].copy(),
             data.twist[part].copy(),
             ranges.copy() if self.task.needs_last_scan else ranges,
-            0.0,
-            0.0,
-            0.0,
         )
         self.simulator.step_part(part, command)
         memory = {name: rows[part] for name, rows in self.memory.items()}

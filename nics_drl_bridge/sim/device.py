@@ -12,7 +12,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.arrays import Array, Integers, Singles
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import measure_clearance
+from nics_drl_bridge.sim.world import check_place
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,7 @@ class DeviceWorld:
         def arranged(scenes: Scenes) -> Array | None:
             world = self.simulator.world.members[int(scenes.member[0])]
             for x, y, _ in [] if placed is None else placed[0].tolist():
-                if measure_clearance(world, x, y) < 0.0:
-                    raise ConfigError(
-                        f"episode_start: ({x:g}, {y:g}) m lies outside the world "
-                        f"{world.name!r}; move it inside."
-                    )
+                check_place("episode_start", world, x, y)
             return self.arrange(scenes, placed)
 
         self.simulator.reset([seed], starts=arranged)

@@ -190,7 +190,6 @@ class SceneSampler:
             sampler.room = int(cells), int(count)
             sampler.scratches = self.samplers[0].scratches
         self.robots = robots
-        self._sizes = len(sizes)
         self.count = int(count) + len(world.spare)
         # spare shapes come last
         self.shapes = (*catalogue.shapes, *world.spare)
@@ -224,12 +223,6 @@ class SceneSampler:
         sizes = np.zeros(n, np.int64)
         if size is not None:
             sizes = np.asarray(size, np.int64)
-        if wanted.shape != (n,) or sizes.shape != (n,):
-            raise ConfigError(
-                f"count {wanted.shape} and size {sizes.shape} must be ({n},)."
-            )
-        if n and not 0 <= sizes.min() <= sizes.max() < self._sizes:
-            raise ConfigError(f"size must be from 0 to {self._sizes - 1}.")
         draws = numbers, wanted, sizes
         scenes = Scenes(
             np.zeros((n, self.count, BODY)),

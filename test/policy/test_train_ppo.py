@@ -64,7 +64,7 @@ def pair(actions="continuous", log_std=-0.5, clip=0.2, entropy=0.01):
     }
     theirs = PPO(
         "MlpPolicy",
-        TrainVecEnv.of(envs[1]),
+        TrainVecEnv(worlds=envs[1]),
         n_steps=STEPS,
         batch_size=batch,
         n_epochs=1,

@@ -1,1 +1,1 @@
-"""Training with Stable-Baselines3."""
+"""What needs PyTorch: training with Stable-Baselines3, and the export of torch modules."""

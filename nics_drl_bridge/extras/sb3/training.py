@@ -54,7 +54,7 @@ class Sb3Training:
         statistics: tuple[Array, Array],
     ) -> None:
         torch.set_num_threads(settings.threads)
-        env = TrainVecEnv.of(worlds)
+        env = TrainVecEnv(worlds=worlds)
         self._total = settings.steps
         self._log_every = LOG_EVERY[settings.algorithm]
         shared: dict[str, Any] = {
