@@ -315,14 +315,10 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
 
     def _make_commands(self, action: AnyArray) -> Array:
         given = guard.check_action(action, self.action_space, "action")
-        made = self.task.drive(given.reshape(self._each), self.ended[None])
-        needed = (1, self.robots, len(self.model.robot.command))
-        if np.shape(made) != needed:
-            raise ConfigError(
-                f"commands are {np.shape(made)}; they must be {needed}: worlds, robots, "
-                "and a robot's commands."
-            )
-        return made
+        commands = self.task.drive(given.reshape(self._each), self.ended[None])
+        shape = (1, self.robots, len(self.model.robot.command))
+        checked: Array = self.task.check_result("drive", commands, shape)
+        return checked
 
     def halt(self) -> None:
         """Stops the robot until the next reset; any exception does so too."""
@@ -388,7 +384,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             ranges=view.ranges[0].copy(),
             bodies=facts.get("bodies", self.scene.bodies),
             goals=find_goals(self.memory),
-            member=int(np.asarray(self.scene.member)),
+            member=self.scene.member,
             step=self._steps,
             estimates=view.pose[0].copy(),
             covariance=None

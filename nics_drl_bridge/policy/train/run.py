@@ -204,15 +204,9 @@ def _restore(
             part.restore(content["state"])
         for env, arrays in zip(training_worlds.envs, content["envs"], strict=True):
             checkpoints.restore(env, arrays)
-    except (
-        AttributeError,
-        IndexError,
-        OverflowError,
-        KeyError,
-        RuntimeError,
-        TypeError,
-        ValueError,
-    ) as error:
+    except ConfigError:
+        raise
+    except Exception as error:  # noqa: BLE001 - damaged content breaks libraries in any way
         raise ConfigError(
             f"{path}: is not the checkpoint of a training "
             f"({shorten(str(error), 120)}); train again."
