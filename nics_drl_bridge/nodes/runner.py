@@ -37,11 +37,7 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.listener import open_context, spin
-from nics_drl_bridge.nodes.own_process import (
-    end_at_once,
-    list_ending_signals,
-    list_log_arguments,
-)
+from nics_drl_bridge.nodes.own_process import list_ending_signals, list_log_arguments
 from nics_drl_bridge.nodes.parameters import (
     Row,
     find_frame_fault,
@@ -78,44 +74,41 @@ def run_node(
     A known error prints one sentence, and ends with exit code 2.
     """
     stopping = threading.Event()
-    for number in list_ending_signals():
-        signal.signal(number, lambda *_: stopping.set())
     words = sys.argv if args is None else args
     try:
-        with end_at_once():
-            context = open_context([*words, *list_log_arguments(words)])
-        return run_until_end(make, context, stopping, sole_name)
+        context = open_context([*words, *list_log_arguments(words)])
+        with open_node(make, context, sole_name) as node:
+            for number in list_ending_signals():
+                signal.signal(number, lambda *_: stopping.set())
+            spin(node, stopping)
+        return node
     except INPUT_ERRORS as error:
         sys.stderr.write(f"{explain(error)}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
 
 
-def run_until_end(
-    make: Callable[..., Node],
-    context: Context,
-    stopping: threading.Event,
-    sole_name: str = "",
-) -> Any:
-    """Make a node by `make(context=...)`, spin it until the end, and destroy it; return it.
+@contextlib.contextmanager
+def open_node(
+    make: Callable[..., Node], context: Context, sole_name: str = ""
+) -> Iterator[Any]:
+    """Make a node by `make(context=...)` and start it; in the end, stop and destroy it.
 
-    The end is an event, or the end of the context, which belongs to the node.
+    The context belongs to the node, and is shut down in the end, too.
     """
-    with contextlib.ExitStack() as undo:
+    with ExitStack() as undo:
         undo.callback(context.try_shutdown)
-        with end_at_once():
-            if sole_name:
-                undo.enter_context(claim_name(context, sole_name))
-            node = make(context=context)
-            undo.callback(_end, node)
-            if hasattr(node, "start"):
-                node.start()
+        if sole_name:
+            undo.enter_context(claim_name(context, sole_name))
+        node = make(context=context)
+        undo.callback(_end, node)
+        if hasattr(node, "start"):
+            node.start()
         gc.collect()  # now, because later it may take 0.1 s while the robot moves
         for sentence in explain_ignored_values(node):  # rclpy ignores them silently
             node.get_logger().warning(sentence)
         if getattr(node, "state", ACTIVE) == ACTIVE:
             node.get_logger().info("running")
-        spin(node, stopping)
-    return node
+        yield node
 
 
 def _end(node: Any) -> None:
@@ -393,8 +386,7 @@ class ManagedNode(BridgeNode, LifecycleNode):
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Configure the node; a failure leaves it unconfigured."""
-        with end_at_once():  # opening a policy may compile; nothing was commanded yet
-            done = self._attempt(self.configure, INACTIVE)
+        done = self._attempt(self.configure, INACTIVE)
         if done == FAILURE:
             self.undo.close()
         return done

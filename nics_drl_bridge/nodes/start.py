@@ -101,7 +101,6 @@ def start(node: str, args: list[str] | None = None) -> None:
     code: Any = 0
     try:
         transport.set_transport(os.environ)
-        own_process.begin_own_process()
         gc.disable()  # what is imported stays, so that looking for garbage finds none
         main = _load_main(node)
         gc.freeze()
