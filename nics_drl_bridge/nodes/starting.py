@@ -94,7 +94,6 @@ class Setup:
 
     def __init__(self, values: Values) -> None:
         self.values: dict[str, Any] = dict(values)
-        # What is wrong is refused here, before any node is started.
         for name in FLAGS:
             word = self[name]
             if word.lower() not in FLAG_WORDS:
@@ -102,15 +101,9 @@ class Setup:
                     f"launch argument {name!r} is {word!r}; give true or false."
                 )
             self.values[name] = FLAG_WORDS[word.lower()]
-        for name in ("params_file", "urdf", "policy"):
-            file = self[name]
-            is_file = name != "policy" or file.endswith((".onnx", ".yaml", ".yml"))
-            if file and is_file and not Path(file).is_file():
-                raise ConfigError(f"{name} {file}: no such file; check the path.")
-        if self["world"] and self["world"] not in list_shipped("worlds"):
-            from nics_drl_bridge.sim.world_set import load_worlds
-
-            load_worlds(self["world"])  # it takes a second
+        file = self["params_file"]
+        if file and not Path(file).is_file():
+            raise ConfigError(f"params_file {file}: no such file; check the path.")
         self.model = self["model"] or DEFAULT_ROBOT
         shipped = share_folder() / "urdf" / f"{self.model}.urdf"
         self._opened: Any = None if shipped.is_file() else open_slowly(self.model)
