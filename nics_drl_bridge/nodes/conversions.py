@@ -147,12 +147,10 @@ def read_initial_pose(
     pose = pose_from_ros(message)[0]
     if frame not in ("", map_frame):
         fix = f"give it in {map_frame!r}, as RViz does if that is its fixed frame."
-        raise ConfigError(
-            f"{INITIAL_POSE}: a pose in the frame {frame!r} is refused; {fix}"
-        )
+        raise ConfigError(f"a pose in the frame {frame!r} is refused; {fix}")
     if not np.isfinite(pose).all():
         fix = "give finite numbers and a quaternion of unit length."
-        raise ConfigError(f"{INITIAL_POSE}: an invalid pose is refused; {fix}")
+        raise ConfigError(f"an invalid pose is refused; {fix}")
     return pose
 
 

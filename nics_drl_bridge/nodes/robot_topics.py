@@ -188,12 +188,9 @@ class RobotTopics:
                 checked = measurement.check_covariance(reported, 3, START_STD)
                 covariance = covariance if checked is None else checked
             self._placed = pose, covariance
-        except ValueError as error:
-            fix = "give a valid one, or zeros. The estimate stays as it is."
-            logger.error(f"{INITIAL_POSE}: {error}; {fix}")
-            return
-        except ConfigError as error:
-            logger.error(f"{error} The estimate stays as it is.")
+        except (ValueError, ConfigError) as error:
+            reason = str(error).rstrip(".")
+            logger.error(f"{INITIAL_POSE}: {reason}. The estimate stays as it is.")
             return
         if self._started:
             self.middleware.place(*self._placed)

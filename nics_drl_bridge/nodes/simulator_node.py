@@ -51,6 +51,7 @@ from nics_drl_bridge.pacing import RealTime, TopicPace
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
 from nics_drl_bridge.sim.occupancy import occupancy, standing
 from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import require_inside
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 CLOCK = "/clock"
@@ -317,7 +318,7 @@ class MapTopic:
         shown = (world, member, poses)
         if shown != self._shown:
             self._shown = shown
-            grid = occupancy(simulator.world.members[member], still, self._cell)
+            grid = occupancy(world.world, still, self._cell)
             frame = self._node.map_frame
             self._map.publish(conversions.map_to_ros(grid, self._node.now_ns, frame))
 
@@ -520,23 +521,14 @@ class DeviceNode(qos.BridgeNode):
     def put_robot(self, port: RobotPort, message: PoseWithCovarianceStamped) -> None:
         """Put a robot at the pose of an `initialpose`, if it can be used."""
         logger = self.get_logger()
-        simulator = self.device.simulator
         try:
             pose = read_initial_pose(message, self.map_frame)
-            world = simulator.world.members[int(simulator.data.member[0])]
-            x1, y1, x2, y2 = world.extent
-            if not (x1 <= pose[0] <= x2 and y1 <= pose[1] <= y2):
-                where = f"x {x1:g} to {x2:g} m, y {y1:g} to {y2:g} m"
-                place = f"x {pose[0]:.2f} m, y {pose[1]:.2f} m"
-                raise ConfigError(
-                    f"{INITIAL_POSE}: {place} is outside the world ({where})."
-                )
+            require_inside(self.device.world, pose)
         except ConfigError as error:
-            logger.error(f"{error} The robot stays where it is.")
+            logger.error(f"{INITIAL_POSE}: {error} The robot stays where it is.")
             return
-        robot = self._ports.index(port)
-        simulator.put_robot(robot, pose, np.zeros(simulator.data.state.shape[-1]))
-        self.device.put(robot)
+        at_rest = np.zeros(len(self.model.robot.state))
+        self.device.put(self._ports.index(port), pose, at_rest)
         logger.info(
             f"the robot was put at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad"
         )

@@ -12,7 +12,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.arrays import Array, Integers, Singles
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import measure_clearance
+from nics_drl_bridge.sim.world import World, measure_clearance
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,14 @@ class DeviceWorld:
         self._covariance = moved(self._covariance, np.tile(self._added, (robots, 1, 1)))
         self._before = simulator.data.pose[0].copy()
 
-    def put(self, robot: int) -> None:
-        """Record that a robot was placed elsewhere, which is not motion."""
+    @property
+    def world(self) -> World:
+        """World of the present episode."""
+        return self.simulator.world.members[int(self.simulator.data.member[0])]
+
+    def put(self, robot: int, pose: Array, state: Array) -> None:
+        """Put a robot at a pose (3,) in a state (S,), which is not motion."""
+        self.simulator.put_robot(robot, pose, state)
         self._before[robot] = self.simulator.data.pose[0, robot]
 
     def advance(self) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import (
     Field,
     PrivateAttr,
@@ -363,6 +364,21 @@ def check_place(
         raise ConfigError(
             f"{what}: ({x:g}, {y:g}) m {reason}; the field is {x1:g} to {x2:g} "
             f"m by {y1:g} to {y2:g} m."
+        )
+
+
+class OutsideError(ConfigError):
+    """A place lies outside the world."""
+
+
+def require_inside(world: World, place: ArrayLike) -> None:
+    """Raise OutsideError for a place (2,) or pose (3,) outside the world."""
+    x, y, *_ = np.asarray(place).tolist()
+    if not _inside(world, x, y):
+        x1, y1, x2, y2 = world.extent
+        spans = f"which spans x {x1:g} to {x2:g} m, y {y1:g} to {y2:g} m"
+        raise OutsideError(
+            f"x {x:g} m, y {y:g} m is outside the world, {spans}; move it."
         )
 
 
