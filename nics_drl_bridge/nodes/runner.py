@@ -265,12 +265,9 @@ def open_parts(kind: str, node: Node) -> list[Any]:
     leader, which may drive the robot to goals of its own; its methods are those of
     `extras.nav2.follow_path.PathActions`. Raises BridgeError.
     """
-    installed = extensions.find_extensions(PARTS)
-    names = [name for name in installed if name.startswith(f"{kind}.")]
-    if not names:  # of an environment that was made before this package had parts
-        fix = "install nics_drl_bridge again."
-        node.get_logger().warning(f"no parts of a {kind} are installed; {fix}")
-    parts = [extensions.load(PARTS, name)(node) for name in names]
+    names = extensions.find_extensions(PARTS)
+    chosen = [name for name in names if name.startswith(f"{kind}.")]
+    parts = [extensions.load(PARTS, name)(node) for name in chosen]
     return [part for part in parts if part is not None]
 
 

@@ -56,7 +56,6 @@ from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 CLOCK = "/clock"
 CLOCK_NS = 15_000_000  # longest time between two ticks of it in real time
-WATCH_S = 2.0  # between two checks for other publishers of /clock
 MAP_S = 0.2  # between two checks of what stands in the world
 QUIET_S = 5.0  # between two equal warnings
 LAGGING_S = 5.0  # diagnostics warn for this long after it fell behind real time
@@ -387,11 +386,10 @@ class DeviceNode(qos.BridgeNode):
     def _open_topics(self) -> None:
         self.outbox = Outbox()
         self._clock_topic = self.create_publisher(Clock, CLOCK, qos.SENSOR_RELIABLE)
-        self._clocks = {self.get_fully_qualified_name()}
         self._ports: list[RobotPort] = []
         self.map_topic = MapTopic(self)
         for name in self._names:
-            self._open_robot(name)
+            self._ports.append(RobotPort(self, name))
         self._open_transforms()
         runner.serve(self, "~/reset", self._reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
@@ -400,19 +398,16 @@ class DeviceNode(qos.BridgeNode):
         self.create_service(SelfTest, "~/self_test", self._test)
         runner.diagnose(self, PART, self._look)
 
-    def _open_robot(self, name: str) -> None:
-        self._ports.append(RobotPort(self, name))
-
     def add_robot(self, namespace: str) -> None:
         """Open the topics of the robot that was added to the device last."""
-        self._open_robot(namespace)
+        self._ports.append(RobotPort(self, namespace))
         self._publish_mounts()
 
     def reopen_robots(self) -> None:
         """Open the topics of exactly the robots of the start."""
         self.remove_robots(range(len(self._ports)))
         for name in self._names:
-            self._open_robot(name)
+            self._ports.append(RobotPort(self, name))
         self._publish_mounts()
 
     def remove_robots(self, gone: Sequence[int]) -> None:
@@ -438,8 +433,6 @@ class DeviceNode(qos.BridgeNode):
             self._fixed.publish(self._transforms(transforms=list(mounts)))
 
     def _start_time(self) -> None:
-        # On the steady clock: with use_sim_time the node's clock would wait for this very node.
-        runner.call_periodically(self, WATCH_S, self._watch)
         step_ns = self.timing.step_ns
         self._odom_pace = TopicPace(self.timing.odom_ns, step_ns)
         self._scan_pace = TopicPace(self.timing.scan_ns, step_ns)
@@ -459,15 +452,6 @@ class DeviceNode(qos.BridgeNode):
             runner.call_periodically(
                 self, 0.0, lambda: None if self.paused else self.step()
             )
-
-    def _watch(self) -> None:
-        names = set(qos.list_owners(self.get_publishers_info_by_topic(CLOCK)))
-        for name in names - self._clocks:
-            self.get_logger().warning(
-                f"{name} publishes {CLOCK} too, and nodes with use_sim_time hear both; give each "
-                "simulator a ROS_DOMAIN_ID of its own, or let one run all robots (`robots`)."
-            )
-        self._clocks |= names
 
     def _look(self) -> runner.Condition:
         facts = {

@@ -13,9 +13,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.errors import BridgeError
@@ -406,18 +404,6 @@ def test_as_fast_as_possible_it_steps_whenever_it_has_the_time(simulate):
             simulated.robot.fire_timers()
         steps = (simulated.node.now_ns - began_ns) / simulated.node.timing.step_ns
         assert steps == (0 if paused else 10)
-
-
-def test_another_simulator_that_publishes_the_time_is_named_once(simulate, logged):
-    node = simulate().node
-    other = Node("other", context=node.context)
-    other.create_publisher(Clock, "/clock", 1)
-    logged.clear()
-    for _ in range(3):
-        node._watch()
-    (line,) = logged
-    assert line.startswith("/other publishes /clock too")
-    other.destroy_node()
 
 
 @pytest.mark.parametrize(
