@@ -193,7 +193,7 @@ class DdsBackend:
         self._subscriptions = {}
         for topic, kind in kinds.items():
             # Callbacks hold no reference to the backend, so that it can be garbage-collected.
-            put = partial(_put, self._inbox, topic)
+            put = partial(self._inbox.put, topic)
             self._subscriptions[topic] = self._link.node.create_subscription(
                 kind, topic, put, qos.SENSOR, raw=True
             )
@@ -346,10 +346,6 @@ class DdsBackend:
     def close(self) -> None:
         """Publish a zero command and end the node."""
         self._link.close()
-
-
-def _put(inbox: Inbox, topic: str, content: bytes) -> None:
-    inbox.put(topic, content)
 
 
 class FleetBackend:
