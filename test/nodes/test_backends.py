@@ -19,8 +19,7 @@ from nics_drl_bridge.errors import (
 )
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import NS_PER_S, Start
-from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes import link
+from nics_drl_bridge.nodes import link, qos
 from nics_drl_bridge.nodes.backends import (
     DdsBackend,
     FleetBackend,
@@ -200,7 +199,7 @@ def test_a_message_that_cant_be_read_is_told_with_its_topic(
     monkeypatch.setattr(
         link,
         "read_message",
-        lambda kind, how, m: read(kind, how, m[:14] if kind == topic else m),
+        lambda kind, how, m: read(kind, how, m[:8] if kind == topic else m),
     )
     with pytest.raises(BackendError, match=f"topic '{topic}': a message can't be read"):
         backend.step(np.array([0.5, 0.1]))
