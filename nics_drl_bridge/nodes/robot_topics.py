@@ -39,7 +39,7 @@ from nics_drl_bridge.nodes.parameters import (
 from nics_drl_bridge.nodes.runner import declare_row, get_flag, get_text
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.recording.imu_axis import GyroReader
-from nics_drl_bridge.recording.topic_roles import IMU_NAMES, list_imu_topics
+from nics_drl_bridge.recording.topic_roles import list_imu_topics
 
 SILENCE_S = 5.0  # diagnostics call a topic stale that has been silent for this long [s]
 KINDS_OF_POSE = {
@@ -127,13 +127,6 @@ class RobotTopics:
         made = self._node.create_subscription(kind, topic, locked, quality)
         self._subscriptions.append(made)
 
-    @property
-    def lacks_gyro(self) -> bool:
-        """True if the model was made with a gyro, and nobody publishes one."""
-        if not self.optional:
-            return False
-        return not any(self._node.count_publishers(topic) for topic in IMU_NAMES)
-
     def _subscribe_imu(self) -> None:
         """Subscribe to the gyro if one is named or the model was made with one."""
         wanted = get_text(self._node, IMU)
@@ -142,10 +135,7 @@ class RobotTopics:
         self._gyro = GyroReader()
         for topic in topics:
             self._subscribe(topic, Imu, partial(self._take_imu, topic), qos.SENSOR)
-        self.optional: tuple[str, ...] = ()  # used if they arrive
-        if wanted == defaults.IMU_TOPIC and topics:
-            self.optional = (measurement.IMU,)
-        elif topics:
+        if topics and wanted != defaults.IMU_TOPIC:  # those are used if they arrive
             self.expected = (*self.expected, measurement.IMU)
             self.expected_topics = (*self.expected_topics, wanted)
 
@@ -219,7 +209,7 @@ class RobotTopics:
         return is_placed or measurement.POSE in self.middleware.cache.newest
 
     def list_silent(self, topics: Iterable[str], longest_s: float) -> list[str]:
-        """Return the topics without a usable datum for so long [s]."""
+        """Return those of some topics without a usable datum for so long [s]."""
         newest = self.middleware.cache.newest
         oldest_ns = self.now_ns() - longest_s * NS_PER_S
         return [
