@@ -48,6 +48,7 @@ from nics_drl_bridge.nodes.frames import (
 from nics_drl_bridge.nodes.link import EPISODE_NS, get_fingerprints
 from nics_drl_bridge.nodes.runner import OK, WARN
 from nics_drl_bridge.pacing import RealTime, TopicPace
+from nics_drl_bridge.recording.messages import get_stamp, read_command
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
 from nics_drl_bridge.sim.occupancy import occupancy, standing
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -223,10 +224,8 @@ class RobotPort:
         self._obey(stamp_ns, twist, self._model.robot.from_cmd_vel)
 
     def _take_ackermann(self, message: Any) -> None:
-        drive = message.drive
-        stamp_ns = conversions.stamp_from_ros(message.header.stamp)
-        fields = (drive.speed, 0.0, drive.steering_angle)
-        self._obey(stamp_ns, fields, self._model.robot.from_fields)
+        fields = read_command(message)
+        self._obey(get_stamp(message), fields, self._model.robot.from_fields)
 
     def _obey(
         self,
@@ -235,9 +234,10 @@ class RobotPort:
         read: Callable[[Sequence[float]], Array],
     ) -> None:
         if stamp_ns and self._node.is_too_old(stamp_ns):
-            why = "its stamp is older than command_timeout"
-            fix = "do both ends use one clock (use_sim_time)?"
-            self._complain(f"a command is ignored, because {why}; {fix}")
+            self._complain(
+                "a command is ignored, because its stamp is older than command_timeout; do both "
+                "ends use one clock (use_sim_time)?"
+            )
         elif all(map(math.isfinite, fields)):
             self._node.take_command(self, read(fields))
         else:
