@@ -310,7 +310,7 @@ class DdsBackend:
             if now_s > repeat_s:
                 self._episodes.repeat()
                 repeat_s = now_s + REPEAT_S
-            self._link.run_callback()
+            self._link.spin()
             self._take_waiting()
 
     def _take_waiting(self) -> None:

@@ -24,7 +24,7 @@ from geometry_msgs.msg import Twist, TwistStamped
 from numpy.typing import NDArray
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -38,17 +38,15 @@ from nics_drl_bridge.interface import S_PER_NS, Start
 from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.command_types import expect_stamped
-from nics_drl_bridge.nodes.listener import ask, holds, open_context, spin
+from nics_drl_bridge.nodes.listener import POLL_S, SpunNode, ask, spin
 from nics_drl_bridge.nodes.own_process import ENDING
 from nics_drl_bridge.nodes.parameters import is_stamped_default
-from nics_drl_bridge.nodes.runner import publish_last
+from nics_drl_bridge.nodes.runner import call_periodically, publish_last
 from nics_drl_bridge.nodes.wire import write_stamped_twist, write_twist
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-# Longest wait of the caller's thread for a callback, between two looks at its condition [s]. Always
-# the same, because rclpy drops callbacks that are ready when the timeout changes.
-POLL_S = 0.01
+LOOK_S = 0.05  # between two looks at a command's timeout [s]
 NO_RANDOMISATION = "none"
 # key of the stamp of an episode's first data in a simulator's diagnostics
 EPISODE_NS = "episode began [ns]"
@@ -56,7 +54,7 @@ EPISODE_NS = "episode began [ns]"
 LOST_S = 1.0
 
 
-class Link:
+class Link(SpunNode):
     """A node in its own context; its end or silence leaves a zero command behind."""
 
     def __init__(
@@ -69,35 +67,29 @@ class Link:
         command_timeout_s: float = math.inf,
         patience_s: float = 0.0,
     ) -> None:
-        namespace = parse_namespace(namespace)
         if threading.current_thread() is threading.main_thread():
             # Signals end Python like an exception, unless the program handles them itself.
             for number in ENDING:
                 if signal.getsignal(number) is signal.SIG_DFL:
                     signal.signal(number, lambda number, _: sys.exit(128 + number))
-        self._thread: threading.Thread | None = None  # of the executor, in real time
-        self._context = open_context(domain_id=domain_id)
+        overrides = [
+            Parameter(name, value=value) for name, value in (parameters or {}).items()
+        ]
+        super().__init__(
+            "bridge_env",
+            domain_id,
+            parse_namespace(namespace),
+            qos.BridgeNode,
+            parameter_overrides=overrides,
+        )
+        self._began_s = time.monotonic()
         self._undo = contextlib.ExitStack()
         self._undo.callback(self._context.try_shutdown)
+        self._undo.callback(self.node.destroy_node)
+        self._undo.callback(self._executor.shutdown, timeout_sec=1.0)
         # Also applies if the link never begins or its owner fails to construct.
         self._closing = weakref.finalize(self, _shut_down, self._undo)
         try:
-            overrides = [
-                Parameter(name, value=value)
-                for name, value in (parameters or {}).items()
-            ]
-            self.node = qos.BridgeNode(
-                "bridge_env",
-                namespace=namespace,
-                context=self._context,
-                start_parameter_services=False,
-                parameter_overrides=overrides,
-            )
-            self._undo.callback(self.node.destroy_node)
-            self._began_s = time.monotonic()
-            self._executor = SingleThreadedExecutor(context=self._context)
-            self._executor.add_node(self.node)
-            self._undo.callback(self._executor.shutdown, timeout_sec=1.0)
             if stamped is None:
                 stamped = self.expects_stamped(command_topic, patience_s)
             # frame of the robot, in which commands are given; unknown until it is set
@@ -115,18 +107,7 @@ class Link:
             self.close()
             raise
 
-    def wait_until(self, condition: Callable[[], Any], seconds: float) -> bool:
-        """Wait until a condition holds, while callbacks run; False if it does not in time."""
-        if self._thread is not None:
-            return holds(condition, seconds, POLL_S)
-        deadline = time.monotonic() + seconds
-        while not condition():
-            if time.monotonic() > deadline:
-                return False
-            self.run_callback()
-        return True
-
-    def run_callback(self) -> None:
+    def spin(self, timeout_s: float = POLL_S) -> None:
         """Wait for a moment for a callback, and run it; only without the link's own thread.
 
         Ctrl-C waits for its end, or it could leave the executor amid its bookkeeping, after which
@@ -134,19 +115,20 @@ class Link:
         """
         try:
             with delay_interrupts():
-                self._executor.spin_once(timeout_sec=POLL_S)
+                super().spin(timeout_s)
         except ExternalShutdownException:
             self.check_open()
 
     def expects_stamped(self, topic: str, patience_s: float) -> bool:
         """Wait for a subscriber of commands; True if it expects stamped ones, or by default."""
         name = self.node.resolve_topic_name(topic)
-        self.wait_until(lambda: self.node.count_subscribers(name) > 0, patience_s)
+        self.until(lambda: self.node.count_subscribers(name) > 0, patience_s)
         heard = expect_stamped(self.node, topic)
         return is_stamped_default() if heard is None else heard
 
     def begin(self) -> None:
         """Let a thread run the callbacks; call it once all subscriptions exist."""
+        call_periodically(self.node, LOOK_S, self._timeout.look)
         self._thread = threading.Thread(
             target=_spin,
             args=(self.node, self._timeout),
@@ -189,7 +171,7 @@ class Link:
         retry_period_s: float = math.inf,
     ) -> Any:
         """Call a service, and again at a period; return the first answer. Raises BackendError."""
-        answer = ask(client, request, timeout_s, self.wait_until, retry_period_s)
+        answer = ask(client, request, timeout_s, self.until, retry_period_s)
         if answer is None:
             reason = f"no answer within {timeout_s:g} s; look at the simulator's log."
             raise BackendError(f"service {client.srv_name}: {reason}")
@@ -231,9 +213,7 @@ class Link:
             needed[f"service {service}"] = client.service_is_ready
         deadline = self._began_s + patience_s
         left_s = deadline - time.monotonic()
-        if not self.wait_until(
-            lambda: all(there() for there in needed.values()), left_s
-        ):
+        if not self.until(lambda: all(there() for there in needed.values()), left_s):
             missing = ", no ".join(
                 name for name, there in needed.items() if not there()
             )
@@ -242,7 +222,7 @@ class Link:
             )
         # A publisher that was killed stays in the graph for a while.
         left_s = deadline - time.monotonic()
-        self.wait_until(lambda: not self.has_rivals(), left_s)
+        self.until(lambda: not self.has_rivals(), left_s)
         self.check_alone()
         self._undo.callback(self._timeout.end)  # before that, nothing was commanded
         gc.collect()  # now, because later it may take 0.1 s while the robot moves
@@ -254,7 +234,7 @@ class Link:
 
 def _spin(node: Node, timeout: CommandTimeout) -> None:
     try:
-        spin(node, threading.Event(), timeout.look)
+        spin(node, threading.Event())
     finally:  # after an error too, since nothing would notice old data
         timeout.end()
         node.context.try_shutdown()
@@ -289,7 +269,7 @@ class CommandTimeout:
         self._due_s = time.monotonic() + self._limit_s if moving else math.inf
 
     def look(self) -> None:
-        """Publish one zero when the time is over; call it often, from another thread."""
+        """Publish one zero when the time is over; called often, in another thread."""
         due_s = self._due_s
         if due_s != self._answered_s and time.monotonic() >= due_s:
             self._answered_s = due_s

@@ -18,6 +18,8 @@ from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes.transport import GREATEST_DOMAIN_ID
 
 SPIN_S = 0.1
+# Longest wait for an event, between two looks at a condition [s]. Always the same, because rclpy
+# drops callbacks that are ready when the timeout changes.
 POLL_S = 0.01
 UNKNOWN = "UnknownROSArgsError"  # of rclpy, which exports it nowhere
 
@@ -89,16 +91,13 @@ def ask(
     return None if answered is None else answered.result()
 
 
-def spin(
-    node: Node, stopping: threading.Event, look: Callable[[], None] = lambda: None
-) -> None:
-    """Spin a node until `stopping` is set or its context has been shut down; `look` often."""
+def spin(node: Node, stopping: threading.Event) -> None:
+    """Spin a node until `stopping` is set or its context has been shut down."""
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     try:
         while node.context.ok() and not stopping.is_set():
             executor.spin_once(timeout_sec=SPIN_S)
-            look()
     except Exception:  # another thread may have shut the context down meanwhile
         if node.context.ok():
             raise
@@ -110,15 +109,21 @@ class SpunNode:
     """A node in a context of its own, spun by its owner's waits, or from `start` on by a thread."""
 
     def __init__(
-        self, name: str, domain_id: int | None = None, namespace: str = ""
+        self,
+        name: str,
+        domain_id: int | None = None,
+        namespace: str = "",
+        make: Callable[..., Node] = Node,
+        **options: Any,
     ) -> None:
         self._context = open_context([], domain_id)
         try:
-            self.node = Node(
+            self.node = make(
                 name,
                 context=self._context,
                 namespace=namespace,
                 start_parameter_services=False,
+                **options,
             )
         except BaseException:
             self._context.try_shutdown()

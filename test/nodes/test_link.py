@@ -19,7 +19,7 @@ from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.sim.world import load_world
 
 pytestmark = pytest.mark.ros
-OPEN = link.open_context
+OPEN = listener.open_context
 AHEAD = np.array([0.5, 0.0, 0.0])
 
 
@@ -29,8 +29,8 @@ def opened(monkeypatch):
     contexts = []
     nodes = []
 
-    def open_context(**options):
-        contexts.append(OPEN(**options))
+    def open_context(*options):
+        contexts.append(OPEN(*options))
         return contexts[-1]
 
     class Node(link.qos.BridgeNode):
@@ -38,7 +38,7 @@ def opened(monkeypatch):
             super().__init__(*args, **options)
             nodes.append(self)
 
-    monkeypatch.setattr(link, "open_context", open_context)
+    monkeypatch.setattr(listener, "open_context", open_context)
     monkeypatch.setattr(link.qos, "BridgeNode", Node)
     return contexts, nodes
 
@@ -98,9 +98,9 @@ def test_ctrl_c_at_any_moment_leaves_the_callbacks_running(domain_id):
             interrupt = partial(os.kill, os.getpid(), signal.SIGINT)
             with pytest.raises(KeyboardInterrupt):  # noqa: PT012 - it may come at once
                 threading.Timer(delay_s, interrupt).start()
-                robot.wait_until(lambda: False, 30.0)
+                robot.until(lambda: False, 30.0)
         count = len(calls)
-        assert robot.wait_until(lambda: len(calls) > count + 10, 30.0)
+        assert robot.until(lambda: len(calls) > count + 10, 30.0)
     finally:
         robot.close()
         signal.signal(signal.SIGINT, before)
