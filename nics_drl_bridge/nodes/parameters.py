@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 from nics_drl_bridge import defaults
 from nics_drl_bridge.config import parse_yaml, read_text
 from nics_drl_bridge.errors import ConfigError, shorten
-from nics_drl_bridge.nodes.path_checks import GoalCheck, ProgressCheck
 from nics_drl_bridge.nodes.transport import is_before_kilted
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
@@ -106,18 +105,13 @@ def find_frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
     return ""
 
 
-def list_checker_rows(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
-    """Return the parameters of the named checks; they are those of Nav2's checkers."""
-    rows = []
-    for names, check in ((goals, GoalCheck), (progress, ProgressCheck)):
-        known: dict[str, Any] = {each.name: each.default for each in fields(check)}
-        known["plugin"] = f"nav2_controller::Simple{check.__name__}er"
-        if check is ProgressCheck:
-            known["required_movement_angle"] = 0.5
-        checks = [row for row in list_rows("checkers", **known) if row.name in known]
-        for name in names:
-            rows += [row._replace(name=f"{name}.{row.name}") for row in checks]
-    return rows
+def list_checker_rows(group: str, names: Sequence[str]) -> list[Row]:
+    """Return the parameters of Nav2's goal or progress checkers (the group) of some names."""
+    return [
+        row._replace(name=f"{name}.{row.name}")
+        for name in names
+        for row in list_rows(group)
+    ]
 
 
 def name_fleet(robots: Any) -> tuple[str, ...]:
@@ -190,5 +184,6 @@ def describe_node(name: str) -> NodeFacts:
     if name == "record_node":
         rows = list_drive_rows()
     if name == "policy_node":
-        rows += list_checker_rows(["general_goal_checker"], ["progress_checker"])
+        rows += list_checker_rows("goal_checker", ["general_goal_checker"])
+        rows += list_checker_rows("progress_checker", ["progress_checker"])
     return NodeFacts(parameters=rows, **facts)

@@ -336,12 +336,10 @@ class PathActions:
         path = PlannedPath(poses)
         self._robot_in(goal.name, frame)
         arrival, progress = self.parameters.checks(*checks)
-        list_checker_rows = (
-            GoalChecker(arrival, not self._robot.steers),
-            ProgressChecker(progress),
-        )
+        goal_checker = GoalChecker(arrival, not self._robot.steers)
+        progress_checker = ProgressChecker(progress)
         now_s = time.monotonic()
-        return Run(goal, frame, path, *list_checker_rows, now_s, now_s)
+        return Run(goal, frame, path, goal_checker, progress_checker, now_s, now_s)
 
     # The robot drives to a goal.
 
