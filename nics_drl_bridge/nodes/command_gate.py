@@ -40,7 +40,6 @@ from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, SCAN
 from nics_drl_bridge.nodes import (
     command_types,
-    device_parameters,
     gate_inputs,
     parameters,
     qos,
@@ -189,7 +188,7 @@ class CommandGate(qos.BridgeNode):
             ),
         )
         kinds = ("none", TWIST, TWIST_STAMPED)
-        raw = device_parameters.get_choice(self, FOREIGN, kinds)
+        raw = runner.get_choice(self, FOREIGN, kinds)
         raw_kind = command_types.name_of(stamped=raw != TWIST)
         command_types.TypeWatch(self, inputs.RAW, raw_kind, FOREIGN_SETTINGS)
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (

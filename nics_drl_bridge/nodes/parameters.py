@@ -23,7 +23,6 @@ REALTIME = "realtime"
 LOCKSTEP = "lockstep"
 MODES = (REALTIME, LOCKSTEP, "as_fast_as_possible")
 NO_POSE = defaults.POSE_TYPE
-POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped")
 STAMPED = "enable_stamped_cmd_vel"
 IMU = "imu"
 BASE_FRAME = "base_frame"

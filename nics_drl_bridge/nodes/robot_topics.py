@@ -17,7 +17,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, LaserScan
 
 from nics_drl_bridge import defaults, geometry
-from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
+from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.sectors import Reader, match_reader
@@ -32,11 +32,9 @@ from nics_drl_bridge.nodes.conversions import INITIAL_POSE, read_initial_pose
 from nics_drl_bridge.nodes.parameters import (
     IMU,
     NO_POSE,
-    POSE_TYPES,
     STAMPED,
-    list_rows,
 )
-from nics_drl_bridge.nodes.runner import declare_row, get_flag, get_text
+from nics_drl_bridge.nodes.runner import get_choice, get_flag, get_text
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.topic_roles import list_imu_topics
@@ -45,13 +43,6 @@ SILENCE_S = 5.0  # diagnostics call a topic stale that has been silent for this 
 KINDS_OF_POSE = {
     kind.__name__: kind for kind in (PoseStamped, PoseWithCovarianceStamped)
 }
-
-
-def declare_sensors(node: Node, stamped: bool | None = None) -> None:
-    """Declare a robot's sensors except scan and odometry, and the command type, if known."""
-    known = {} if stamped is None else {STAMPED: stamped}
-    for row in list_rows("sensors", "stamped", **known):
-        declare_row(node, row)
 
 
 class RobotTopics:
@@ -99,14 +90,9 @@ class RobotTopics:
             measurement.SCAN: (LaserScan, self._take_scan),
             measurement.ODOM: (Odometry, self._take_odometry),
         }
-        pose_type = get_text(node, "pose_type")
+        pose_type = get_choice(node, "pose_type", (NO_POSE, *KINDS_OF_POSE))
         self._posed = pose_type != NO_POSE
         if self._posed:
-            if pose_type not in POSE_TYPES:
-                fix = suggest(pose_type, (NO_POSE, *POSE_TYPES))
-                raise ConfigError(
-                    f"parameter 'pose_type': there is no {pose_type!r}; {fix}"
-                )
             heard[measurement.POSE] = (KINDS_OF_POSE[pose_type], self._take_pose)
         for sensor in model.sensors:
             take_reading = partial(self._take_reading, sensor)

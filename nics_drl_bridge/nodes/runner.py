@@ -188,6 +188,16 @@ def get_flag(node: Node, name: str) -> bool:
     return bool(node.get_parameter(name).value)
 
 
+def get_choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
+    """Return a parameter that must be one of `valid`. Raises ConfigError with the nearest word."""
+    value = get_text(node, name)
+    if value not in valid:
+        raise ConfigError(
+            f"parameter {name!r}: unknown value {value!r}; {suggest(value, valid)}"
+        )
+    return value
+
+
 def declare_row(node: Node, row: Row) -> Any:
     """Declare a parameter unless the node has it, and return its value."""
     if node.has_parameter(row.name):

@@ -661,7 +661,7 @@ class DeviceNode(qos.BridgeNode):
 def declare_renderer(node: Node, default: Renderer) -> Renderer:
     """Declare the parameter `renderer`, and return its value."""
     runner.declare_rows(node, "renderer", renderer=default)
-    return cast(Renderer, device_parameters.get_choice(node, "renderer", RENDERERS))
+    return cast(Renderer, runner.get_choice(node, "renderer", RENDERERS))
 
 
 def make_fast_simulator(

@@ -17,7 +17,8 @@ from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.listener import SpunNode
-from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
+from nics_drl_bridge.nodes.robot_topics import RobotTopics
+from nics_drl_bridge.nodes.runner import declare_rows
 from nics_drl_bridge.sim.world import World, check_place
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
@@ -65,7 +66,7 @@ class RosSource:
         self._drawn_ns = 0
         self._spun = SpunNode(NAME, domain_id, parse_namespace(namespace))
         self._node = self._spun.node
-        declare_sensors(self._node)
+        declare_rows(self._node, "sensors", "stamped")
         self._topics = RobotTopics(
             self._node, model, on_lidar=partial(setattr, self, "_new_lidar")
         )
