@@ -105,9 +105,9 @@ def dds_backend(
         namespaces = options.pop("namespaces", name_fleet(robots))
         if mode != LOCKSTEP or len(namespaces) != robots:
             needed = f"in mode 'lockstep' alone, with {robots} namespaces"
-            value = f"not in {mode!r} with {list(namespaces)!r}"
             raise ConfigError(
-                f"backend_options: a team of {robots} robots is driven {needed}, {value}."
+                f"backend_options: a team of {robots} robots is driven {needed}, not in "
+                f"{mode!r} with {list(namespaces)!r}."
             )
         refuse_unknown("backend 'dds'", options, option_names - {"namespace"})
         return FleetBackend(model, world, namespaces, **options)
@@ -239,8 +239,10 @@ class DdsBackend:
         """Check and publish a command (C,), the first half of a step."""
         self._link.check_open()
         if not self._can_send:
-            reason = "its data did not arrive, or no episode has begun; call reset()."
-            raise BackendError(f"the last step did not end: {reason}")
+            raise BackendError(
+                "the last step did not end: its data did not arrive, or no episode has begun; "
+                "call reset()."
+            )
         # If the simulator ran ahead, its data would be taken for the answer to this command.
         self._take_waiting()
         self._check_stamps()
@@ -329,11 +331,10 @@ class DdsBackend:
             if not ahead_ns:
                 continue
             self._link.check_alone()
-            fix = (
-                "start the simulator with mode:=lockstep, and move it from here alone."
+            raise BackendError(
+                f"topic {topic!r}: stamped {ahead_ns / NS_PER_S:+.3f} s off the step; start "
+                "the simulator with mode:=lockstep, and move it from here alone."
             )
-            off = f"stamped {ahead_ns / NS_PER_S:+.3f} s off the step"
-            raise BackendError(f"topic {topic!r}: {off}; {fix}")
 
     def facts(self) -> BackendFacts:
         """Return the newest true pose, if `truth`, and with a randomisation how to draw scenes."""

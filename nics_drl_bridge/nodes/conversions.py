@@ -186,9 +186,9 @@ def map_from_ros(message: OccupancyGrid) -> GridMap:
         or not cells.size
         or not info.resolution > 0.0
     ):
-        size = f"{info.height} x {info.width} of {info.resolution:g} m"
         raise ConfigError(
-            f"map: {cells.size} cells do not make {size}; check its publisher."
+            f"map: {cells.size} cells do not make {info.height} x {info.width} of "
+            f"{info.resolution:g} m; check its publisher."
         )
     place = info.origin.position
     turn = info.origin.orientation
@@ -259,9 +259,9 @@ def find_sensor_type(sensor: Sensor) -> Any:
     """Return the class of a further sensor's message. Raises ConfigError if it is missing."""
     kind = find_message_type(sensor.message)
     if kind is None:
-        missing = f"the message {sensor.message} is not installed; install its package"
         raise ConfigError(
-            f"sensor {sensor.name!r}: {missing} with your ROS 2 distribution."
+            f"sensor {sensor.name!r}: the message {sensor.message} is not installed; install "
+            "its package with your ROS 2 distribution."
         )
     return kind
 

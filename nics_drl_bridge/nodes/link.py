@@ -144,8 +144,10 @@ class Link(SpunNode):
         """Publish linear.x, linear.y, angular.z (3,); for NaN or inf, a zero and BackendError."""
         if not all(map(math.isfinite, twist)):
             self.halt()
-            fix = "finite, a zero was sent instead; look at what the task's `command` returns."
-            raise BackendError(f"command {twist} for {self._topic}: must be {fix}")
+            raise BackendError(
+                f"command {twist} for {self._topic}: must be finite, a zero was sent instead; "
+                "look at what the task's `command` returns."
+            )
         self._timeout.begin(moving=True)
         if self._kind is Twist:
             self.commands.publish(write_twist(twist))
@@ -173,8 +175,10 @@ class Link(SpunNode):
         """Call a service, and again at a period; return the first answer. Raises BackendError."""
         answer = ask(client, request, timeout_s, self.until, retry_period_s)
         if answer is None:
-            reason = f"no answer within {timeout_s:g} s; look at the simulator's log."
-            raise BackendError(f"service {client.srv_name}: {reason}")
+            raise BackendError(
+                f"service {client.srv_name}: no answer within {timeout_s:g} s; look at the "
+                "simulator's log."
+            )
         return answer
 
     def has_rivals(self) -> bool:
@@ -350,8 +354,10 @@ class EpisodeServices:
         facts = self._read_facts(timeout_s)
         for key, mine in self._identity.items():
             if facts.get(key) != mine:
-                runs = f"the simulator runs the {key} {facts.get(key)!r}, this env {mine!r}"
-                raise ModelError(f"{runs}; start both with the same {key}.")
+                raise ModelError(
+                    f"the simulator runs the {key} {facts.get(key)!r}, this env {mine!r}; "
+                    f"start both with the same {key}."
+                )
         result = self._link.call(self._parameters, request, timeout_s).result
         if not result.successful:
             raise BackendError(f"the simulator refused the episode: {result.reason}")
@@ -405,5 +411,6 @@ def read_message(topic: str, read: Callable[[bytes], T], content: bytes) -> T:
     try:
         return read(content)
     except wire.UNREADABLE as error:
-        reason = f"a message can't be read ({error}); check its publisher."
-        raise BackendError(f"topic {topic!r}: {reason}") from None
+        raise BackendError(
+            f"topic {topic!r}: a message can't be read ({error}); check its publisher."
+        ) from None

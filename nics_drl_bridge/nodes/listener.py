@@ -43,9 +43,9 @@ def open_context(
         return context
     except RuntimeError as error:
         if type(error).__name__ == UNKNOWN:
-            fix = "as in `--ros-args -p NAME:=VALUE -r FROM:=TO --params-file FILE`"
             raise BackendError(
-                f"ROS 2 knows no argument {error}; write them {fix}."
+                f"ROS 2 knows no argument {error}; write them as in `--ros-args -p NAME:=VALUE "
+                "-r FROM:=TO --params-file FILE`."
             ) from None
         raise BackendError(
             f"ROS 2 does not start: {' '.join(str(error).split())}"

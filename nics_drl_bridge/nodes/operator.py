@@ -276,8 +276,10 @@ class Operator:
     ) -> str:
         """Return a sentence that says where nobody is, and which others there are."""
         domain = self._node.context.get_domain_id()
-        where = f"in namespace {space or '/'} of ROS domain {domain}"
-        fault = f"no {what} was seen {where} within {seconds:g} s"
+        fault = (
+            f"no {what} was seen in namespace {space or '/'} of ROS domain {domain} within "
+            f"{seconds:g} s"
+        )
         if not others:
             return f"{fault}; start one, as by `nics up simulation`, in the same ROS_DOMAIN_ID."
         first = get_namespace_of(others[0]).strip("/")

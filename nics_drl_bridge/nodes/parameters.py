@@ -95,8 +95,10 @@ def find_frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
         if not FRAME.fullmatch(frame) and (
             frame or name not in (*MAY_BE_EMPTY, *may_be_empty)
         ):
-            needed = "must be 1 to 255 characters, without blanks or a leading /"
-            return f"parameter {name!r}: {needed}, not {shorten(frame, 80)!r}."
+            return (
+                f"parameter {name!r}: must be 1 to 255 characters, without blanks or a leading /, "
+                f"not {shorten(frame, 80)!r}."
+            )
     base = frames.get(BASE_FRAME, "")
     for name in (MAP_FRAME, "odom_frame"):
         if base and frames.get(name, "") == base:
@@ -124,8 +126,10 @@ def name_fleet(robots: Any) -> tuple[str, ...]:
     names = tuple(robots) if is_list else ()
     valid = all(isinstance(name, str) and NAMESPACE.fullmatch(name) for name in names)
     if not valid or not len(names) == len(set(names)) in range(1, GREATEST_FLEET + 1):
-        fix = f"give a count from 1 to {GREATEST_FLEET}, or a list of different namespaces"
-        raise ConfigError(f"'robots' is {robots!r}; {fix}, as in [robot1, robot2].")
+        raise ConfigError(
+            f"'robots' is {robots!r}; give a count from 1 to {GREATEST_FLEET}, or a list of "
+            "different namespaces, as in [robot1, robot2]."
+        )
     return names
 
 

@@ -50,8 +50,10 @@ class PolicyNode(ManagedNode):
         self._open_policy(model)
         goal = self._goal = np.array(self.get_parameter("goal").value, np.float64)
         if len(goal) != 2 or not (abs(goal).max() <= 1e8 or np.isnan(goal).all()):
-            needed = "must be [x, y] within 1e8 m, or both NaN to wait for goal_pose"
-            raise ConfigError(f"parameter 'goal': {needed}, not {goal.tolist()}.")
+            raise ConfigError(
+                "parameter 'goal': must be [x, y] within 1e8 m, or both NaN to wait for "
+                f"goal_pose, not {goal.tolist()}."
+            )
         self._read_pace(model.control_period)
         self._acted_ns = 0
         self._answer = None
@@ -88,8 +90,10 @@ class PolicyNode(ManagedNode):
         names = ("rate", "deadline", "late_limit")
         rate, limit_s, patience = (self.get_parameter(name).value for name in names)
         if rate < 0.0 or limit_s <= 0.0:
-            values = f"parameters rate {rate}, deadline {limit_s}"
-            raise ConfigError(f"{values}: must be at least 0, and more than 0.")
+            raise ConfigError(
+                f"parameters rate {rate}, deadline {limit_s}: must be at least 0, and more "
+                "than 0."
+            )
         if np.isnan(limit_s):
             limit_s = 0.5 * period_s
         self._deadline = Deadline(limit_s, patience)
@@ -126,8 +130,9 @@ class PolicyNode(ManagedNode):
         self._open_policy(replace(self._model, lidar=lidar))
         begin, end = np.degrees([lidar.angles[0], lidar.angles[-1]])
         done = "used" if self._task.scan is None else "resampled"
-        span = f"from {begin:.4g} to {end:.4g} deg"
-        self.get_logger().info(f"scans of {lidar.beams} beams {span} are {done}")
+        self.get_logger().info(
+            f"scans of {lidar.beams} beams from {begin:.4g} to {end:.4g} deg are {done}"
+        )
 
     def _on_goal(self, message: PoseStamped) -> None:
         stamp_ns = conversions.stamp_from_ros(message.header.stamp)

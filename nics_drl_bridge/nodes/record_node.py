@@ -181,8 +181,10 @@ class RecordNode(qos.BridgeNode):
         return False
 
     def _place(self, topic: str) -> str:
-        place = f"namespace {self.get_namespace()!r}, ROS domain {self.context.get_domain_id()}"
-        return f"{self.resolve_topic_name(topic)!r} ({place})"
+        return (
+            f"{self.resolve_topic_name(topic)!r} (namespace {self.get_namespace()!r}, ROS domain "
+            f"{self.context.get_domain_id()})"
+        )
 
     def _go_on(self) -> None:
         self._guard()
@@ -200,10 +202,10 @@ class RecordNode(qos.BridgeNode):
         age = time.monotonic() - self._heard
         limit = runner.get_number(self, "odom_timeout")
         if age > limit:
-            reason = f"nothing new for {age:.2f} s (the limit is {limit:g} s)"
             place = self._place("odom")
             raise BackendError(
-                f"topic {place}: {reason}; find out why odometry stopped."
+                f"topic {place}: nothing new for {age:.2f} s (the limit is {limit:g} s); find "
+                "out why odometry stopped."
             )
         bound = self._plan.bound
         radius = self._plan.robot.footprint_radius
@@ -211,10 +213,10 @@ class RecordNode(qos.BridgeNode):
             self._start, self._start if self._pose is None else self._pose
         )
         if np.hypot(x, y) + radius > bound:
-            where = f"at x {x:.2f}, y {y:.2f} m from the start with a radius of {radius:g} m"
-            fix = "give a larger bound, less speed, or the robot's true parameters."
             raise BackendError(
-                f"the robot left its circle of {bound:g} m, {where}; {fix}"
+                f"the robot left its circle of {bound:g} m, at x {x:.2f}, y {y:.2f} m from the "
+                f"start with a radius of {radius:g} m; give a larger bound, less speed, or the "
+                "robot's true parameters."
             )
 
     def _send(self, command: Array) -> None:

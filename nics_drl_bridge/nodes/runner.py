@@ -140,11 +140,9 @@ def claim_name(context: Context, name: str) -> Iterator[None]:
         try:
             claim.bind(f"\0nics_drl_bridge {key}")
         except OSError:
-            fix = (
-                "end it, or give this one a namespace: `--ros-args -r __ns:=/robot_2`."
-            )
             raise BackendError(
-                f"a node {whole!r} already runs in ROS domain {domain}; {fix}"
+                f"a node {whole!r} already runs in ROS domain {domain}; end it, or give this "
+                "one a namespace: `--ros-args -r __ns:=/robot_2`."
             ) from None
         yield
 
@@ -245,11 +243,14 @@ def explain_ignored_values(node: Node) -> list[str]:
         if name == SHARED or node.has_parameter(name) or ignores(name):
             continue
         if not name.startswith(qos.OVERRIDES):
-            fix = f"its value is ignored; {suggest(name, names)}"
-            sentences.append(f"there is no parameter {name!r}, {fix}")
+            sentences.append(
+                f"there is no parameter {name!r}, its value is ignored; {suggest(name, names)}"
+            )
         elif has_topics:
-            why = "the node has no such publisher or subscription"
-            sentences.append(f"parameter {name!r} is ignored: {why}.")
+            sentences.append(
+                f"parameter {name!r} is ignored: the node has no such publisher or "
+                "subscription."
+            )
     return sentences
 
 
@@ -386,9 +387,11 @@ class ManagedNode(BridgeNode, LifecycleNode):
             (*self.get_parameters_by_prefix("").values(), *parameters)
         )
         if late and self.state != UNCONFIGURED:
-            lead = f"`ros2 lifecycle set {self.get_fully_qualified_name()} deactivate`"
-            fix = f"return it to unconfigured by {lead}, then `cleanup`."
-            reason = f"parameter {late[0]!r} is read when the node is configured; {fix}"
+            reason = (
+                f"parameter {late[0]!r} is read when the node is configured; return it to "
+                f"unconfigured by `ros2 lifecycle set {self.get_fully_qualified_name()} "
+                "deactivate`, then `cleanup`."
+            )
         return SetParametersResult(successful=not reason, reason=reason)
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:

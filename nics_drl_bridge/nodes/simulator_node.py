@@ -530,8 +530,10 @@ class DeviceNode(qos.BridgeNode):
         if self._real_time.lost(steady_ns, self.now_ns):
             self._lags += 1
             self._lagged_s = time.monotonic()
-            fix = "choose a lower rate, scan_rate or odom_rate, or fewer robots"
-            warning = f"this machine does not keep up with real time; {fix}"
+            warning = (
+                "this machine does not keep up with real time; choose a lower rate, scan_rate or "
+                "odom_rate, or fewer robots"
+            )
             self.get_logger().warning(warning, throttle_duration_sec=5.0)
             self._real_time.begin(steady_ns, self.now_ns + self.timing.step_ns)
         behind = self._real_time.behind(steady_ns, self.now_ns)

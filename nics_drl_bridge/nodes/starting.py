@@ -134,9 +134,9 @@ class Setup:
         """Return the URDF of the robot. Raises ConfigError if no argument names the robot."""
         own_file = self["params_file"] not in ("", str(find_config("bridge", "nodes")))
         if own_file and not (self["model"] or self["urdf"]):
-            fix = "say model:=ROBOT or urdf:=FILE, or use_robot_state_pub:=false"
             raise ConfigError(
-                f"{STATE_PUBLISHER} has to know which robot it is; {fix}."
+                f"{STATE_PUBLISHER} has to know which robot it is; say model:=ROBOT or "
+                "urdf:=FILE, or use_robot_state_pub:=false."
             )
         base = self[BASE_FRAME] or BASE_LINK
         laser = self["laser_frame"]
@@ -329,10 +329,10 @@ def parse_start(start: str) -> list[float] | None:
     except ValueError:
         numbers = [0.0]
     if len(numbers) % 3:
-        fix = (
-            "give x, y, heading [m, rad] of each robot, as in start:='[1.0, 0.0, 1.57]'"
+        raise ConfigError(
+            f"launch argument 'start' is {start!r}; give x, y, heading [m, rad] of each robot, "
+            "as in start:='[1.0, 0.0, 1.57]'."
         )
-        raise ConfigError(f"launch argument 'start' is {start!r}; {fix}.")
     return numbers or None
 
 

@@ -175,10 +175,10 @@ class PathActions:
             name: conversions.find_message_type(kind) for name, kind in KINDS.items()
         }
         if None in self._kinds.values():
-            why = (
-                "the package nav2_msgs is not installed, so its actions are not served"
+            node.get_logger().info(
+                "the package nav2_msgs is not installed, so its actions are not served; "
+                "install it with your ROS 2 distribution."
             )
-            node.get_logger().info(f"{why}; install it with your ROS 2 distribution.")
             return
         self._serve(FOLLOW, self._follow)
         if node.get_parameter(NAVIGATE).value:
@@ -297,9 +297,11 @@ class PathActions:
     def _navigate(self, goal: Goal) -> Run:
         asked = goal.handle.request
         if asked.behavior_tree:
-            fix = "leave it empty, or let Nav2 serve the action"
-            reason = f"behaviour trees such as {asked.behavior_tree!r} are not supported; {fix}."
-            raise Refusal("FAILED_TO_LOAD_BEHAVIOR_TREE", f"{NAVIGATE}: {reason}")
+            raise Refusal(
+                "FAILED_TO_LOAD_BEHAVIOR_TREE",
+                f"{NAVIGATE}: behaviour trees such as {asked.behavior_tree!r} are not "
+                "supported; leave it empty, or let Nav2 serve the action.",
+            )
         end = np.array([read_pose(asked.pose)])
         with refuse_config_errors(goal, "TF_ERROR"):
             frame, end = self._frames.fixed(asked.pose.header.frame_id, end)
@@ -320,9 +322,10 @@ class PathActions:
     def _robot_in(self, name: str, frame: str) -> Array:
         robot = self._frames.locate_robot(frame)
         if robot is None:
-            fix = "send the goal again once odometry and pose have arrived"
             raise Refusal(
-                "TF_ERROR", f"{name}: the robot's pose is not known yet; {fix}."
+                "TF_ERROR",
+                f"{name}: the robot's pose is not known yet; send the goal again once odometry "
+                "and pose have arrived.",
             )
         return robot
 

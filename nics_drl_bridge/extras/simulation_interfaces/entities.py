@@ -125,8 +125,11 @@ class EntityServices:
         name = names.get(frame, frame)
         entity = next((entity for entity in entities if entity.name == name), None)
         if entity is None:
-            fix = "leave it empty for the world, or name an entity"
-            raise RefusalError(code, f"the frame {frame!r} is not known here; {fix}.")
+            raise RefusalError(
+                code,
+                f"the frame {frame!r} is not known here; leave it empty for the world, or name "
+                "an entity.",
+            )
         return entities.pose(entity)
 
     def delete(self, request: Any, _: Any) -> None:
@@ -140,9 +143,9 @@ class EntityServices:
         name = self._choose_name(request, "" if model is None else model.name)
         space = request.entity_namespace
         if space and not NAMESPACE.fullmatch(space):
-            fault = f"entity_namespace {space!r} is no namespace of ROS"
             raise RefusalError(
-                SpawnResult.NAMESPACE_INVALID, f"{fault}; write it as in 'robot_1'."
+                SpawnResult.NAMESPACE_INVALID,
+                f"entity_namespace {space!r} is no namespace of ROS; write it as in 'robot_1'.",
             )
         code = SpawnResult.INVALID_POSE
         base = self._find_frame(request.initial_pose.header.frame_id, code)
@@ -219,13 +222,16 @@ class EntityServices:
         if not wanted and request.allow_renaming:
             wanted = "entity"
         if not NAME.fullmatch(wanted):
-            fault = f"the name {wanted!r} is not valid; use up to 120 letters, digits, and _ . / -"
-            raise RefusalError(SpawnResult.NAME_INVALID, f"{fault} between them.")
+            raise RefusalError(
+                SpawnResult.NAME_INVALID,
+                f"the name {wanted!r} is not valid; use up to 120 letters, digits, and _ . / - "
+                "between them.",
+            )
         free = self._simulation.entities.find_free_name(wanted)
         if free != wanted and not request.allow_renaming:
-            fix = "give another, or set allow_renaming"
             raise RefusalError(
-                SpawnResult.NAME_NOT_UNIQUE, f"the name {wanted!r} is taken; {fix}."
+                SpawnResult.NAME_NOT_UNIQUE,
+                f"the name {wanted!r} is taken; give another, or set allow_renaming.",
             )
         return free
 

@@ -156,9 +156,10 @@ class Entities:
         """
         still = entity.robot < 0 and entity.motion is None
         if still and twist is not None and twist.any():
-            fix = "set only its pose, or a zero twist"
-            fault = f"{entity.name!r} stands still and takes no twist"
-            raise ConfigError(f"{fault}; {fix}.")
+            raise ConfigError(
+                f"{entity.name!r} stands still and takes no twist; set only its pose, or a "
+                "zero twist."
+            )
         if pose is not None:
             require_inside(self.device.world, pose)
         if entity.robot >= 0:
