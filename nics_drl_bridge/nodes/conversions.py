@@ -147,12 +147,10 @@ def read_initial_pose(
     pose = pose_from_ros(message)[0]
     if frame not in ("", map_frame):
         fix = f"give it in {map_frame!r}, as RViz does if that is its fixed frame."
-        raise ConfigError(
-            f"{INITIAL_POSE}: a pose in the frame {frame!r} is refused; {fix}"
-        )
+        raise ConfigError(f"a pose in the frame {frame!r} is refused; {fix}")
     if not np.isfinite(pose).all():
         fix = "give finite numbers and a quaternion of unit length."
-        raise ConfigError(f"{INITIAL_POSE}: an invalid pose is refused; {fix}")
+        raise ConfigError(f"an invalid pose is refused; {fix}")
     return pose
 
 
@@ -188,9 +186,9 @@ def map_from_ros(message: OccupancyGrid) -> GridMap:
         or not cells.size
         or not info.resolution > 0.0
     ):
-        size = f"{info.height} x {info.width} of {info.resolution:g} m"
         raise ConfigError(
-            f"map: {cells.size} cells do not make {size}; check its publisher."
+            f"map: {cells.size} cells do not make {info.height} x {info.width} of "
+            f"{info.resolution:g} m; check its publisher."
         )
     place = info.origin.position
     turn = info.origin.orientation
@@ -261,9 +259,9 @@ def find_sensor_type(sensor: Sensor) -> Any:
     """Return the class of a further sensor's message. Raises ConfigError if it is missing."""
     kind = find_message_type(sensor.message)
     if kind is None:
-        missing = f"the message {sensor.message} is not installed; install its package"
         raise ConfigError(
-            f"sensor {sensor.name!r}: {missing} with your ROS 2 distribution."
+            f"sensor {sensor.name!r}: the message {sensor.message} is not installed; install "
+            "its package with your ROS 2 distribution."
         )
     return kind
 

@@ -9,7 +9,7 @@ from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from nics_drl_bridge.errors import ConfigError, suggest
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes.parameters import (
@@ -19,7 +19,7 @@ from nics_drl_bridge.nodes.parameters import (
     list_rows,
     name_fleet,
 )
-from nics_drl_bridge.nodes.runner import declare_rows, get_number, get_text
+from nics_drl_bridge.nodes.runner import declare_rows, get_choice, get_number, get_text
 from nics_drl_bridge.pacing import find_common_step
 from nics_drl_bridge.robot.noise import Delay
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
@@ -130,16 +130,6 @@ def apply_timing(
     if steps == model.timing.substeps:
         return model
     return replace(model, control_period=steps * dt)
-
-
-def get_choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
-    """Return a parameter that must be one of `valid`. Raises ConfigError with the nearest word."""
-    value = get_text(node, name)
-    if value not in valid:
-        raise ConfigError(
-            f"parameter {name!r}: unknown value {value!r}; {suggest(value, valid)}"
-        )
-    return value
 
 
 def get_frames(node: Node, namespace: str) -> Frames:

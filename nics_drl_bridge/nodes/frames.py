@@ -51,8 +51,10 @@ def find_transforms(node: Node, lacking: str) -> Any | None:
     """Return the class of the messages on `/tf`; None, with a warning of what is lacking then."""
     kind = conversions.transforms_type()
     if kind is None:
-        reason = f"the package tf2_msgs is not installed, so {lacking} not published"
-        node.get_logger().warning(f"{reason}; {explain_install('tf2_msgs')}.")
+        node.get_logger().warning(
+            f"the package tf2_msgs is not installed, so {lacking} not published; "
+            f"{explain_install('tf2_msgs')}."
+        )
     return kind
 
 
@@ -164,8 +166,9 @@ class GoalFrames:
         """Return x, y (2,) of a goal in the map, given the robot's pose now. Raises ConfigError."""
         place = np.array([goal.pose.position.x, goal.pose.position.y, 0.0])
         if not np.isfinite(place).all():
-            position = f"({place[0]:g}, {place[1]:g})"
-            raise ConfigError(f"goal_pose: {position}: x and y must be finite numbers.")
+            raise ConfigError(
+                f"goal_pose: ({place[0]:g}, {place[1]:g}): x and y must be finite numbers."
+            )
         try:
             frame, place = self.fixed(goal.header.frame_id, place)
         except ConfigError as error:

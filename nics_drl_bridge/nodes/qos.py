@@ -117,8 +117,10 @@ def override_qos(node: Node, topic: str, end: str) -> Iterator[dict[str, Any]]:
     given = get_given_values(node)
     names = sorted(name for name in given if name.startswith(prefix))
     if names and topic.rsplit("/", 1)[-1] in FIXED_TOPICS:
-        reason = "can't be overridden, because the robot's stop depends on it"
-        raise ConfigError(f"parameter {names[0]!r}: {reason}; leave it out.")
+        raise ConfigError(
+            f"parameter {names[0]!r}: can't be overridden, because the robot's stop depends on "
+            "it; leave it out."
+        )
     if not names:
         yield {}
         return
@@ -126,8 +128,9 @@ def override_qos(node: Node, topic: str, end: str) -> Iterator[dict[str, Any]]:
     try:
         yield {"qos_overriding_options": QoSOverridingOptions(kinds)}
     except RuntimeError as error:
-        fix = "correct it, or leave it out"
-        raise ConfigError(f"parameter {names[0]!r}: {error}; {fix}.") from None
+        raise ConfigError(
+            f"parameter {names[0]!r}: {error}; correct it, or leave it out."
+        ) from None
 
 
 class BridgeNode(Node):

@@ -23,11 +23,9 @@ from nics_drl_bridge.middleware.measurement import CMD_VEL, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.listener import holds
-from nics_drl_bridge.nodes.parameters import NO_POSE
-from nics_drl_bridge.nodes.robot_topics import (
-    RobotTopics,
-    declare_sensors,
-)
+from nics_drl_bridge.nodes.parameters import NO_POSE, STAMPED
+from nics_drl_bridge.nodes.robot_topics import RobotTopics
+from nics_drl_bridge.nodes.runner import declare_rows
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 POLL_S = 0.01
@@ -147,7 +145,8 @@ class RealtimeBackend:
                 stamped = self._link.expects_stamped(CMD_VEL, chosen.timeout_s)
             elif stamped is None:
                 stamped = self._link.stamped
-            declare_sensors(self._link.node, stamped)
+            known = {STAMPED: stamped}
+            declare_rows(self._link.node, "sensors", "stamped", **known)
             self._topics = RobotTopics(self._link.node, model, now_ns=time.monotonic_ns)
             self._episodes = EpisodeServices(self._link, chosen.simulator, model, world)
             self._link.begin()

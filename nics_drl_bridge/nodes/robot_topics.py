@@ -17,7 +17,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, LaserScan
 
 from nics_drl_bridge import defaults, geometry
-from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
+from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.sectors import Reader, match_reader
@@ -32,26 +32,17 @@ from nics_drl_bridge.nodes.conversions import INITIAL_POSE, read_initial_pose
 from nics_drl_bridge.nodes.parameters import (
     IMU,
     NO_POSE,
-    POSE_TYPES,
     STAMPED,
-    list_rows,
 )
-from nics_drl_bridge.nodes.runner import declare_row, get_flag, get_text
+from nics_drl_bridge.nodes.runner import get_choice, get_flag, get_text
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.recording.imu_axis import GyroReader
-from nics_drl_bridge.recording.topic_roles import IMU_NAMES, list_imu_topics
+from nics_drl_bridge.recording.topic_roles import list_imu_topics
 
 SILENCE_S = 5.0  # diagnostics call a topic stale that has been silent for this long [s]
 KINDS_OF_POSE = {
     kind.__name__: kind for kind in (PoseStamped, PoseWithCovarianceStamped)
 }
-
-
-def declare_sensors(node: Node, stamped: bool | None = None) -> None:
-    """Declare a robot's sensors except scan and odometry, and the command type, if known."""
-    known = {} if stamped is None else {STAMPED: stamped}
-    for row in list_rows("sensors", "stamped", **known):
-        declare_row(node, row)
 
 
 class RobotTopics:
@@ -99,14 +90,9 @@ class RobotTopics:
             measurement.SCAN: (LaserScan, self._take_scan),
             measurement.ODOM: (Odometry, self._take_odometry),
         }
-        pose_type = get_text(node, "pose_type")
+        pose_type = get_choice(node, "pose_type", (NO_POSE, *KINDS_OF_POSE))
         self._posed = pose_type != NO_POSE
         if self._posed:
-            if pose_type not in POSE_TYPES:
-                fix = suggest(pose_type, (NO_POSE, *POSE_TYPES))
-                raise ConfigError(
-                    f"parameter 'pose_type': there is no {pose_type!r}; {fix}"
-                )
             heard[measurement.POSE] = (KINDS_OF_POSE[pose_type], self._take_pose)
         for sensor in model.sensors:
             take_reading = partial(self._take_reading, sensor)
@@ -127,13 +113,6 @@ class RobotTopics:
         made = self._node.create_subscription(kind, topic, locked, quality)
         self._subscriptions.append(made)
 
-    @property
-    def lacks_gyro(self) -> bool:
-        """True if the model was made with a gyro, and nobody publishes one."""
-        if not self.optional:
-            return False
-        return not any(self._node.count_publishers(topic) for topic in IMU_NAMES)
-
     def _subscribe_imu(self) -> None:
         """Subscribe to the gyro if one is named or the model was made with one."""
         wanted = get_text(self._node, IMU)
@@ -142,10 +121,7 @@ class RobotTopics:
         self._gyro = GyroReader()
         for topic in topics:
             self._subscribe(topic, Imu, partial(self._take_imu, topic), qos.SENSOR)
-        self.optional: tuple[str, ...] = ()  # used if they arrive
-        if wanted == defaults.IMU_TOPIC and topics:
-            self.optional = (measurement.IMU,)
-        elif topics:
+        if topics and wanted != defaults.IMU_TOPIC:  # those are used if they arrive
             self.expected = (*self.expected, measurement.IMU)
             self.expected_topics = (*self.expected_topics, wanted)
 
@@ -188,12 +164,9 @@ class RobotTopics:
                 checked = measurement.check_covariance(reported, 3, START_STD)
                 covariance = covariance if checked is None else checked
             self._placed = pose, covariance
-        except ValueError as error:
-            fix = "give a valid one, or zeros. The estimate stays as it is."
-            logger.error(f"{INITIAL_POSE}: {error}; {fix}")
-            return
-        except ConfigError as error:
-            logger.error(f"{error} The estimate stays as it is.")
+        except (ValueError, ConfigError) as error:
+            reason = str(error).rstrip(".")
+            logger.error(f"{INITIAL_POSE}: {reason}. The estimate stays as it is.")
             return
         if self._started:
             self.middleware.place(*self._placed)
@@ -222,7 +195,7 @@ class RobotTopics:
         return is_placed or measurement.POSE in self.middleware.cache.newest
 
     def list_silent(self, topics: Iterable[str], longest_s: float) -> list[str]:
-        """Return the topics without a usable datum for so long [s]."""
+        """Return those of some topics without a usable datum for so long [s]."""
         newest = self.middleware.cache.newest
         oldest_ns = self.now_ns() - longest_s * NS_PER_S
         return [

@@ -27,7 +27,7 @@ from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.link import Link
-from nics_drl_bridge.nodes.listener import Listener
+from nics_drl_bridge.nodes.listener import SpunNode
 from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 
 GRACE_S = 0.25  # after the exception, for the last motion on `cmd_vel`
@@ -46,7 +46,7 @@ BARS = {
 Rng = np.random.Generator
 
 
-class Watcher(Listener):
+class Watcher(SpunNode):
     """Listens in a thread of its own."""
 
     def __init__(self, domain_id: int) -> None:
@@ -55,8 +55,8 @@ class Watcher(Listener):
             tuple[float, bool]
         ] = []  # time of each command [s]; does it move?
         self.speed = 0.0  # true one of the robot [m/s]
-        self.create_subscription(Twist, "cmd_vel", self._hear, qos.EVERY_COMMAND)
-        self.create_subscription(Odometry, "ground_truth", self._see, qos.SENSOR)
+        self.node.create_subscription(Twist, "cmd_vel", self._hear, qos.EVERY_COMMAND)
+        self.node.create_subscription(Odometry, "ground_truth", self._see, qos.SENSOR)
         self.start()
 
     def _hear(self, message: Twist) -> None:

@@ -13,9 +13,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.errors import BridgeError
@@ -369,7 +367,7 @@ def test_an_initial_pose_puts_the_robot_there_unless_it_can_not_be_used(
     assert simulated.pose() == pytest.approx([0.4, -2.2, 1.0], abs=0.01)
     assert simulated.pose("odom") == pytest.approx(before, abs=0.05)  # it goes on
     for wrong, sentence in (
-        (put_at(9.0, 0.0, 0.0, "site"), "x 9.00 m, y 0.00 m is outside the world"),
+        (put_at(9.0, 0.0, 0.0, "site"), "(9, 0) m lies outside the world"),
         (put_at(0.0, 0.0, 0.0, "kitchen"), "in the frame 'kitchen' is refused"),
         (put_at(math.nan, 0.0, 0.0, "site"), "an invalid pose is refused"),
     ):
@@ -406,18 +404,6 @@ def test_as_fast_as_possible_it_steps_whenever_it_has_the_time(simulate):
             simulated.robot.fire_timers()
         steps = (simulated.node.now_ns - began_ns) / simulated.node.timing.step_ns
         assert steps == (0 if paused else 10)
-
-
-def test_another_simulator_that_publishes_the_time_is_named_once(simulate, logged):
-    node = simulate().node
-    other = Node("other", context=node.context)
-    other.create_publisher(Clock, "/clock", 1)
-    logged.clear()
-    for _ in range(3):
-        node._watch()
-    (line,) = logged
-    assert line.startswith("/other publishes /clock too")
-    other.destroy_node()
 
 
 @pytest.mark.parametrize(
