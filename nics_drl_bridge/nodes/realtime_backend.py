@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
 from nics_drl_bridge import defaults, geometry
@@ -19,6 +20,7 @@ from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array, BackendFacts, RobotView, Start
+from nics_drl_bridge.middleware.ekf import START_STD
 from nics_drl_bridge.middleware.measurement import CMD_VEL, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
@@ -183,7 +185,7 @@ class RealtimeBackend:
                 raise StaleDataError(topic, math.inf, timeout_s)
         elif self._options.lays_map:
             with self._topics.lock:
-                self._topics.place(start.pose)
+                self._topics.place(start.pose, START_STD**2 * np.eye(3))
         self._misses = 0
         self._deadline_ns = time.monotonic_ns() + self._period_ns
         view, _ = self._take_view()
