@@ -17,13 +17,11 @@ from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.messages import (
     get_stamp,
+    read_pose_covariance,
     read_turn_variance,
     read_twist,
     read_whole_pose,
 )
-
-# x, y and heading in the 6 x 6 covariance of a message
-PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 
 
 class Intake:
@@ -102,10 +100,8 @@ class Intake:
         return self.middleware.odometry(stamp_ns, arrival_ns, pose, twist, variance)
 
     def _take_pose(self, arrival_ns: int, message: Any) -> bool:
-        covariance = getattr(message.pose, "covariance", None)
-        if covariance is not None:
-            covariance = np.reshape(covariance, (6, 6))[PLANAR]
         pose = read_whole_pose(message)
+        covariance = read_pose_covariance(message)
         return self.middleware.pose(get_stamp(message), arrival_ns, pose, covariance)
 
     def _take_imu(self, arrival_ns: int, message: Any) -> bool:

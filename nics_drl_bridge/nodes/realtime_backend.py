@@ -250,19 +250,16 @@ class RealtimeBackend:
         arrival time of the last one is still known.
         """
         now_ns = time.monotonic_ns()
+        silences_s = {}
         with self._topics.lock:
             cache = self._topics.middleware.cache
-            newest = dict(cache.newest)
-            arrived_ns = {topic: times[-1] for topic, times in cache.arrivals.items()}
-        latest_ns = max((datum.stamp_ns for datum in newest.values()), default=0)
-        silences_s = dict.fromkeys(self._topics.expected, math.inf)
-        for topic in self._topics.expected:
-            if topic in newest:
-                since_arrival_ns = now_ns - newest[topic].arrival_ns
-                behind_ns = latest_ns - newest[topic].stamp_ns
-                silences_s[topic] = max(since_arrival_ns, behind_ns) / NS_PER_S
-            elif topic in arrived_ns:
-                silences_s[topic] = (now_ns - arrived_ns[topic]) / NS_PER_S
+            latest_ns = self._topics.newest_ns
+            for topic in self._topics.expected:
+                silence_s = cache.silence_s(topic, now_ns)
+                if topic in cache.newest:
+                    behind_ns = latest_ns - cache.newest[topic].stamp_ns
+                    silence_s = max(silence_s, behind_ns / NS_PER_S)
+                silences_s[topic] = silence_s
         return silences_s
 
     def _is_vehicle(self) -> bool:

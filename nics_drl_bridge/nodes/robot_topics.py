@@ -19,7 +19,7 @@ from sensor_msgs.msg import Imu, LaserScan
 from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, RobotView
+from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.sectors import Reader, match_reader
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
 from nics_drl_bridge.middleware import measurement
@@ -137,7 +137,7 @@ class RobotTopics(Intake):
             pose = read_initial_pose(message, get_text(self._node, "map_frame"))
             covariance = START_STD**2 * np.eye(3)
             if self._posed:  # otherwise nothing corrects this pose: it defines the map
-                _, reported = conversions.pose_from_ros(message)
+                reported = messages.read_pose_covariance(message)
                 checked = measurement.check_covariance(reported, 3, START_STD)
                 covariance = covariance if checked is None else checked
         except (ValueError, ConfigError) as error:
@@ -171,13 +171,9 @@ class RobotTopics(Intake):
 
     def list_silent(self, topics: Iterable[str], longest_s: float) -> list[str]:
         """Return those of some topics without a usable datum for so long [s]."""
-        newest = self.middleware.cache.newest
-        oldest_ns = self.now_ns() - longest_s * NS_PER_S
-        return [
-            topic
-            for topic in topics
-            if topic not in newest or newest[topic].arrival_ns < oldest_ns
-        ]
+        cache = self.middleware.cache
+        now_ns = self.now_ns()
+        return [topic for topic in topics if cache.silence_s(topic, now_ns) > longest_s]
 
     def view(self) -> RobotView:
         """Return the view at the stamp of the newest datum."""
