@@ -25,7 +25,6 @@ from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, to_device
 from nics_drl_bridge.recording import messages
-from nics_drl_bridge.recording.topic_roles import TRANSFORMS
 from nics_drl_bridge.robot.spec import RobotSpec
 
 INITIAL_POSE = "initialpose"  # topic, as RViz sends it
@@ -235,11 +234,6 @@ def find_message_type(kind: str) -> Any | None:
         return getattr(import_module(f"{package}.{interface}"), name, None)
     except ImportError:
         return None
-
-
-def transforms_type() -> Any | None:
-    """Return the class of the messages on `/tf`; None if its package is not installed."""
-    return find_message_type(TRANSFORMS)
 
 
 def find_sensor_type(sensor: Sensor) -> Any:

@@ -127,9 +127,7 @@ class RealtimeBackend:
         )
         if chosen.gated:
             command_timeout_s = math.inf  # a gate has its own timeout
-        _ = (
-            model.robot.cmd_vel_places
-        )  # refuse a robot without them before waiting for it
+        model.robot.require_cmd_vel()
         rehearse(model)
         self._link = Link(
             chosen.namespace,
