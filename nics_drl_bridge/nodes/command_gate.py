@@ -214,7 +214,7 @@ class CommandGate(qos.BridgeNode):
             command_types.KINDS[raw_kind],
             inputs.RAW,
             partial(self._take_command, raw),
-            qos.EVERY_POLICY,
+            qos.EVERY_COMMAND,
             raw=True,
         )
         self._sources = Sources(self, commands.topic_name)

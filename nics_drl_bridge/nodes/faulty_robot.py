@@ -202,10 +202,6 @@ class Robot(SpunNode):
         """Call a service of the gate. Raises TimeoutError without an answer in time."""
         return self.call_service(Trigger, f"command_gate/{service}", patience_s)
 
-    def listeners(self) -> int:
-        """Return the number of subscribers of its scans."""
-        return int(self._topics["scan"].get_subscription_count())
-
     @property
     def moves(self) -> bool:
         """True if the newest command moves it."""

@@ -17,6 +17,7 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.message_packages import explain_install
 from nics_drl_bridge.nodes.runner import get_text
 from nics_drl_bridge.recording import messages
+from nics_drl_bridge.recording.topic_roles import TRANSFORMS
 
 if TYPE_CHECKING:
     from nics_drl_bridge.nodes.robot_topics import RobotTopics
@@ -49,7 +50,7 @@ def compute_odom_in_map(in_map: ArrayLike, in_odom: ArrayLike) -> Array:
 
 def find_transforms(node: Node, lacking: str) -> Any | None:
     """Return the class of the messages on `/tf`; None, with a warning of what is lacking then."""
-    kind = conversions.transforms_type()
+    kind = conversions.find_message_type(TRANSFORMS)
     if kind is None:
         node.get_logger().warning(
             f"the package tf2_msgs is not installed, so {lacking} not published; "
@@ -120,7 +121,7 @@ class GoalFrames:
         # frame -> its parent, and its pose in the parent
         self._mounted: dict[str, tuple[str, Array]] = {}
         self._odom: Array | None = None  # pose of `odom` in `map`, by a localiser
-        self._transforms = conversions.transforms_type()
+        self._transforms = conversions.find_message_type(TRANSFORMS)
         self._heard = []
         if self._transforms is not None:
             for topic, take, quality in (

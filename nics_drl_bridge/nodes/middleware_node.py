@@ -92,8 +92,7 @@ class MiddlewareNode(ManagedNode):
             self.get_logger().warning(
                 f"rejected data, counted in /diagnostics: {listed}"
             )
-        heard = self._topics.middleware.cache.newest
-        awaited = dict.fromkeys((*self._topics.expected, *heard))
+        awaited = dict.fromkeys((*self._topics.expected, *health.topics))
         silent = self._topics.list_silent(awaited, SILENCE_S)
         level = STALE if silent else OK
         message = "receiving" if self.state == ACTIVE else self.state

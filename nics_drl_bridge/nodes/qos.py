@@ -68,8 +68,8 @@ requested again."""
 SENSOR_RELIABLE = make_profile(Offer(10))
 
 EVERY_COMMAND = make_profile(Offer(10))
-"""Commands in lock-step: each one moves the world, so a second publisher must not replace the
-first one's command unnoticed."""
+"""Commands in lock-step, each of which moves the world, and commands whose publisher the gate
+checks: a second publisher must not replace the first one's command unnoticed."""
 
 E_STOP = QoSProfile(
     history=rclpy_qos.HistoryPolicy.KEEP_ALL,
@@ -81,9 +81,6 @@ another publisher, must not push it out of the queue while nobody reads."""
 
 # commands and goals: only the newest counts, and it must arrive
 COMMAND = make_profile(Offer(1))
-# Commands whose publisher the gate checks: one that a second publisher sends at the same moment
-# must not replace the first one's unnoticed.
-EVERY_POLICY = make_profile(Offer(10))
 # `/tf`: like tf2's own, whose listeners request reliable
 TRANSFORMS = make_profile(Offer(100))
 # `/tf_static`, `map`: late joiners get them too

@@ -150,12 +150,9 @@ class RosSource:
         if request.kind == "goal":
             if self._within is not None:
                 check_place("goal", self._within, request.x, request.y)
-            message = PoseStamped()
-            message.header.stamp = self._node.get_clock().now().to_msg()
-            message.header.frame_id = self._map_frame
-            message.pose.position.x, message.pose.position.y = request.x, request.y
-            message.pose.orientation.w = 1.0
-            self._goals.publish(message)
+            goal = (request.x, request.y, 0.0)
+            now_ns = self._topics.now_ns()
+            self._goals.publish(conversions.pose_to_ros(goal, now_ns, self._map_frame))
         return False
 
     def close(self) -> None:

@@ -60,12 +60,14 @@ class DeviceWorld:
     def begin(self, seed: int, starts: Array | None) -> None:
         """Begin the episode of a seed, at `starts` (3 M,) x, y, heading if given."""
         robots = self._given
-        if starts is not None and starts.size != 3 * robots:
-            raise ConfigError(
-                f"episode_start has {starts.size} numbers; {robots} robots need "
-                f"{3 * robots}: x, y, heading of each."
-            )
-        placed = None if starts is None else starts.reshape(1, robots, 3)
+        placed = None
+        if starts is not None:
+            if starts.size != 3 * robots or not np.isfinite(starts).all():
+                raise ConfigError(
+                    f"episode_start is {starts.tolist()}; give x, y, heading of each robot: "
+                    f"{3 * robots} finite numbers."
+                )
+            placed = starts.reshape(1, robots, 3)
 
         def arranged(scenes: Scenes) -> Array | None:
             world = self.simulator.world.members[int(scenes.member[0])]

@@ -162,9 +162,6 @@ def test_a_reset_begins_where_the_parameters_say_and_a_self_test_shows_what_runs
     ("values", "reason"),
     [
         ({"episode_seed": -1}, "episode_seed"),
-        ({"episode_start": [1.0, 2.0, math.inf]}, "three finite numbers"),
-        ({"episode_start": [1.0, 2.0, math.nan]}, "three finite numbers"),
-        ({"episode_start": 6 * [1.0]}, "episode_start has 6 numbers; give 3"),
         ({"world": "empty"}, "read-only"),
     ],
 )
@@ -172,6 +169,18 @@ def test_a_parameter_it_cant_use_is_refused_with_the_reason(lockstep, values, re
     result = lockstep.robot.set_to(**values)
     assert not result.successful
     assert reason in result.reason
+
+
+@pytest.mark.parametrize(
+    "start", [[1.0, 2.0, math.inf], [1.0, 2.0, math.nan], 6 * [1.0]]
+)
+def test_no_episode_begins_at_a_start_that_it_cant_use(lockstep, start):
+    began_ns = lockstep.node.now_ns
+    assert lockstep.robot.set_to(episode_start=start).successful
+    answer = lockstep.robot.call("~/reset")
+    assert not answer.success
+    assert "give x, y, heading of each robot: 3 finite numbers" in answer.message
+    assert lockstep.node.now_ns == began_ns
 
 
 def test_a_command_that_can_not_be_used_is_ignored_and_reported(lockstep, logged):
@@ -414,7 +423,7 @@ def test_as_fast_as_possible_it_steps_whenever_it_has_the_time(simulate):
         ("world:=areena", BridgeError, "did you mean 'arena'"),
         ("rate:=fast", ParameterException, "rate"),
         ("rate:=-1.0", ParameterException, "rate"),
-        ("episode_start:=[1.0, 2.0]", ParameterException, "has 2 numbers; give 3"),
+        ("episode_start:=[1.0, 2.0]", BridgeError, "3 finite numbers"),
         ("base_frame:=map", BridgeError, "must differ"),
     ],
 )

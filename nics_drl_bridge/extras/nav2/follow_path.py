@@ -282,13 +282,10 @@ class PathActions:
         asked = goal.handle.request
         names = []
         for kind, names_of_kind in self.parameters.names.items():
-            name, wrong = choose_plugin(
-                kind.replace("_", " "), getattr(asked, f"{kind}_id", ""), names_of_kind
-            )
-            if wrong:  # the code of Nav2's own server
-                code = "INVALID_CONTROLLER" if kind == "controller" else "UNKNOWN"
-                raise Refusal(code, f"{FOLLOW}: {wrong}")
-            names.append(name)
+            code = "INVALID_CONTROLLER" if kind == "controller" else "UNKNOWN"
+            with refuse_config_errors(goal, code):
+                name = getattr(asked, f"{kind}_id", "")
+                names.append(choose_plugin(kind, name, names_of_kind))
         poses = np.array([read_pose(pose) for pose in asked.path.poses]).reshape(-1, 3)
         headers = [asked.path.header, *(pose.header for pose in asked.path.poses[:1])]
         frame = next((header.frame_id for header in headers if header.frame_id), "")
@@ -332,11 +329,10 @@ class PathActions:
     def _begin(
         self, goal: Goal, frame: str, poses: Array, checks: Sequence[str]
     ) -> Run:
-        with refuse_config_errors(goal, goal.code):
-            PlannedPath(poses)  # before its frame is looked at
         with refuse_config_errors(goal, "TF_ERROR"):
             frame, poses = self._frames.fixed(frame, poses)
-        path = PlannedPath(poses)
+        with refuse_config_errors(goal, goal.code):
+            path = PlannedPath(poses)
         self._robot_in(goal.name, frame)
         arrival, progress = self.parameters.checks(*checks)
         goal_checker = GoalChecker(arrival, not self._robot.steers)

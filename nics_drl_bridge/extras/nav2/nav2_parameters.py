@@ -71,13 +71,12 @@ class ControllerParameters:
         return name in UNUSED or name.split(".")[0] in chain(*self.names.values())
 
 
-def choose_plugin(what: str, asked: str, known: Sequence[str]) -> tuple[str, str]:
-    """Return a plugin's name and what is wrong with it; an empty name selects the only plugin."""
-    if not asked and len(known) == 1:
-        return known[0], ""
-    if asked in known:
-        return asked, ""
-    return (
-        "",
-        f"there is no {what} {asked!r}; name one of {', '.join(map(repr, known))}.",
-    )
+def choose_plugin(kind: str, name: str, known: Sequence[str]) -> str:
+    """Return a plugin's name; an empty one selects the only plugin. Raises ConfigError."""
+    if not name and len(known) == 1:
+        return known[0]
+    if name not in known:
+        what = kind.replace("_", " ")
+        names = ", ".join(map(repr, known))
+        raise ConfigError(f"there is no {what} {name!r}; name one of {names}.")
+    return name
