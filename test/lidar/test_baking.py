@@ -77,13 +77,6 @@ def test_a_table_that_no_index_can_reach_is_refused(monkeypatch):
         bake(SPEC, [SQUARE], Density(distances=50, rotations=40))
 
 
-def test_the_points_of_a_row_are_near_each_other_whatever_the_beams():
-    beams = [2048, 720, 360, 180, 90, 36, 1]
-    phases = [Density.for_beams(2.0 * np.pi / count).phases for count in beams]
-    assert phases == [1, 1, 2, 4, 8, 8, 8]
-    assert bake(lidar(beams=180), [SQUARE]).density.phases == 4
-
-
 def test_a_shape_that_covers_more_beams_than_a_row_has_is_refused_with_the_way_out():
     narrow = lidar(beams=100_000, angle_min=-0.5, angle_max=0.7)
     with pytest.raises(
