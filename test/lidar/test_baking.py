@@ -10,7 +10,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.bake import add_shapes, bake
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle
-from nics_drl_bridge.lidar.table import Density, LidarTable, count_padding
+from nics_drl_bridge.lidar.table import Density, LidarTable
 
 SPEC = lidar(beams=360, range_min=0.0)
 SMALL = Density(distances=12, rotations=16)
@@ -50,14 +50,6 @@ def test_equal_shapes_are_baked_once_and_circles_at_one_rotation():
     table = bake(SPEC, (SQUARE, Circle(radius=0.2), SQUARE), SMALL)
     assert table.shapes == (SQUARE, Circle(radius=0.2))
     assert table.grid[:, 1].tolist() == [4.0, 1.0]  # a quarter of 16; none
-
-
-def test_rows_lie_apart_within_the_table_and_leave_room_at_its_end():
-    table = bake(SPEC, (SQUARE, STRIP), SMALL)
-    ends = table.start + table.cell[:, 1].astype(int) * table.density.phases
-    assert table.start[0] == 0
-    assert np.array_equal(table.start[1:], ends[:-1])
-    assert len(table.rows) == ends[-1] + count_padding(SPEC.angle_increment)
 
 
 @pytest.mark.parametrize(

@@ -22,23 +22,14 @@ MODEL = builtin_model("ackermann")
 STEP = 0.05
 
 
-def odometry(t, shift=0.0):
-    inner = bags.new(
-        "geometry_msgs/PoseWithCovariance", bags.pose(*bags.place_at(t)), np.zeros(36)
-    )
-    twist = bags.new(
-        "geometry_msgs/TwistWithCovariance", bags.twist(0.5, 0.0, 0.25), np.zeros(36)
-    )
-    stamp = None if shift is None else t + shift
-    return bags.new(
-        "nav_msgs/msg/Odometry", bags.header(stamp, "odom"), "base_link", inner, twist
-    )
+def odometry(t, stamp):
+    return bags.moving_odometry(stamp, bags.place_at(t), (0.5, 0.0, 0.25))
 
 
 def drive(**changed):
     """Half a circle."""
     topics = {
-        "/odom": [(t + 0.01, odometry(t)) for t in bags.times(STEP, DURATION_S)],
+        "/odom": [(t + 0.01, odometry(t, t)) for t in bags.times(STEP, DURATION_S)],
         "/cmd_vel": [
             (t, bags.twist(0.5, 0.0, 0.1)) for t in bags.times(0.1, DURATION_S)
         ],

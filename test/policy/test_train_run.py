@@ -4,11 +4,11 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from importlib.util import find_spec
 
 import filelock
 import pytest
+from browser import until
 from typer.testing import CliRunner
 
 from nics_drl_bridge.commands.cli import app
@@ -257,7 +257,11 @@ def test_an_interrupted_training_tells_the_command_that_resumes_it(tmp_path):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as process:
         checkpoint = tmp_path / "my run" / "seed_3" / "checkpoint.npz"
-        wait_for(lambda: checkpoint.is_file() or process.poll() is not None, 300.0)
+        until(
+            lambda: checkpoint.is_file() or process.poll() is not None,
+            "a checkpoint",
+            300.0,
+        )
         process.send_signal(signal.SIGINT)
         said = process.communicate(timeout=60.0)[1]
     assert process.returncode == 130, said
@@ -271,11 +275,3 @@ def test_an_interrupted_training_tells_the_command_that_resumes_it(tmp_path):
         "nics train --resume --out 'my run' --seeds 3 4 --episodes 7 --task own.py:Mine"
     )
     assert command == expected
-
-
-def wait_for(condition, timeout_s):
-    """Waits until a condition holds; fails after a deadline."""
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
