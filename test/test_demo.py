@@ -156,7 +156,9 @@ def test_it_goes_the_whole_road_and_leaves_a_report(tmp_path, drive):
     [
         pytest.param("training", "^  .* steps: success", 1, (), marks=campaign),
         pytest.param("in process", "^  seed 0: ", 1000, READY_MADE, marks=campaign),
-        ("over DDS", "^driving the same .* over DDS", 20, READY_MADE),
+        pytest.param(
+            "over DDS", "^driving the same .* over DDS", 20, READY_MADE, marks=campaign
+        ),
         pytest.param("in real time", "^deploying ", 1, READY_MADE, marks=campaign),
     ],
 )

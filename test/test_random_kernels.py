@@ -79,13 +79,6 @@ def test_sums_of_two_numbers_of_the_pool_are_standard_normal_within_a_50000th():
 
 
 @pytest.mark.slow
-def test_signs_of_draws_are_independent_of_each_other_and_of_their_sizes(thousands):
-    sample = thousands[..., :1056].reshape(-1, random.RUN)
-    apart = np.corrcoef(sample, rowvar=False)[np.triu_indices(random.RUN, 1)]
-    assert np.abs(apart).max() < 5.0 / np.sqrt(len(sample))
-
-
-@pytest.mark.slow
 def test_bits_of_a_key_are_uniform_and_hardly_repeat():
     @njit
     def drawn(count):

@@ -80,6 +80,7 @@ MISTAKES = {
     "world draw clutter --footprint -1": "--footprint -1: must be above 0 m",
     "record --out d.npz --preview --speed 3": "speed",
     # Files that are not there, or are something else.
+    "generate nothing.npz --out m": "nothing.npz: no such file",
     "generate table.csv --map good.yaml --topic pose=/p --out m": "name the topics in the map",
     "inspect table.csv --map begun.yaml": "already exists; give another name",
     "import table.csv --map begun.yaml --out d.csv": "must end in .npz",
@@ -99,6 +100,7 @@ MISTAKES = {
     "train --robot differential --out run": "run: contains a run with other settings",
     "evaluate differential --backend dds": "--backend dds drives the vehicle: add --hardware",
     "evaluate differential --hardware --goal 2": "--goal",
+    "evaluate differential --hardware --start presnt": "'--start': .*'presnt'.*'present'",
     "evaluate differential ackermann": "evaluate them one by one",
     "doctor --model differential --policy differential": "give only one",
     "doctor --namespace a/-b": "namespace 'a/-b': must be words of letters, digits and _",
