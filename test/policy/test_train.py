@@ -155,22 +155,12 @@ def test_a_little_training_reaches_more_goals_than_none(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path):
+def test_a_checkpoint_of_another_training_is_refused(tmp_path):
     train(settings(steps=128), 0, tmp_path)
     with pytest.raises(ConfigError, match=r"was trained with hidden \[16\], not \[8\]"):
         train(settings(steps=128, hidden=[8]), 0, tmp_path, resumed=True)
     with pytest.raises(ConfigError, match="has seed 0, not 4"):
         train(settings(steps=128), 4, tmp_path, resumed=True)
-    path = tmp_path / CHECKPOINT
-    whole = path.read_bytes()
-    flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 1
-    for damaged in (whole[:-500], bytes(flipped), whole[:-71]):
-        path.write_bytes(damaged)
-        with pytest.raises(
-            ConfigError, match="is not a training checkpoint, or is damaged"
-        ):
-            read_checkpoint(path)
 
 
 @pytest.mark.parametrize("resumed", [False, True])
