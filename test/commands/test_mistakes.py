@@ -136,6 +136,10 @@ MODULES = {
     ("train", "onnxruntime"): r"pip install 'nics_drl_bridge\[deploy\]'",
     ("evaluate straight --in dds", "rclpy"): r"pip install 'nics_drl_bridge\[ros\]'",
     (
+        "train --engine sb3",
+        "stable_baselines3",
+    ): r"pip install 'nics_drl_bridge\[sb3\]'",
+    (
         "train --engine ray",
         "ray",
     ): r"pip install 'nics_drl_bridge\[sb3,train,distributed\]'",

@@ -4,7 +4,6 @@ import json
 import signal
 import subprocess
 import sys
-from importlib.util import find_spec
 
 import filelock
 import pytest
@@ -63,16 +62,6 @@ def no_torch(monkeypatch):
             monkeypatch.delitem(sys.modules, name)
     for name in ("torch", "stable_baselines3"):
         monkeypatch.setitem(sys.modules, name, None)
-
-
-def test_stable_baselines3_is_asked_for_by_the_name_of_its_extra(
-    tmp_path, settings, no_torch
-):
-    done = nics("--settings", settings, "--engine", "sb3", "--out", tmp_path / "run")
-    assert done.exit_code == 2
-    words = " ".join(done.output.split())
-    assert "pip install 'nics_drl_bridge[sb3]'" in words
-    assert not (tmp_path / "run" / "settings.yaml").exists()
 
 
 @pytest.mark.slow
@@ -224,15 +213,6 @@ def test_a_training_beside_another_in_one_folder_is_refused(tmp_path, settings):
         done.output.split()
     )
     assert nics("--settings", settings, "--episodes", 2, "--out", out).exit_code == 0
-
-
-@pytest.mark.skipif(find_spec("ray") is not None, reason="Ray is there")
-def test_where_ray_is_missing_one_sentence_says_what_to_install(tmp_path):
-    done = nics("--engine", "ray", "--out", tmp_path)
-    assert done.exit_code == 2
-    words = " ".join(done.output.split())
-    assert "engine 'ray' needs the module 'ray'" in words
-    assert "pip install 'nics_drl_bridge[sb3,train,distributed]'" in words
 
 
 @pytest.mark.process
