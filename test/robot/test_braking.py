@@ -17,7 +17,6 @@ from nics_drl_bridge.robot.braking import (
     Braking,
     Drift,
     TurnBraking,
-    _find_min_fraction,
     derive_slowest_model,
     find_braking,
     list_motions,
@@ -337,9 +336,3 @@ def test_time_and_distance_are_those_of_even_braking_after_the_reaction():
     assert braking.time_s(straight) == pytest.approx(2.2)
     assert braking.time_s(mixed) == pytest.approx(1.4)  # of its slower part
     assert braking.mean_time_s(mixed) == pytest.approx(0.9)
-
-
-def test_no_share_of_a_bound_of_zero_is_taken():
-    bounded = _find_min_fraction(np.array([0.0, 0.3]), np.array([0.0, 0.5]))
-    assert bounded == pytest.approx(0.6)
-    assert _find_min_fraction(np.zeros(2), np.zeros(2)) == 1.0
