@@ -229,6 +229,19 @@ CAMPAIGNS: dict[str, Campaign] = {
     "parity_fleet": Campaign(
         "--steps 25 --robot ackermann --robots 2 --seed 5", {}, ROS, "parity"
     ),
+    "ros_fleet": Campaign(
+        "--robots 2 --seconds 2",
+        {
+            "standing": Control("the commands: no robot drives", ": driven_m 0"),
+            "deaf": Control(
+                "the topics of one robot, which nobody receives",
+                "robot2: scan 0:",
+                "--robots 2 --seconds 2 --patience 15",
+            ),
+        },
+        ROS,
+        attempts=REAL_TIME,
+    ),
     "shield": Campaign(
         "--episodes 18",
         {
