@@ -90,6 +90,16 @@ FAULTS = (
     "no_motion",
 )
 CAMPAIGNS: dict[str, Campaign] = {
+    "barn_in_dart": Campaign(
+        "--every 50 --poses 4",
+        {
+            "moved": Control(
+                "the place: this package's worlds are moved by 5 cm",
+                "beams within 1 cm",
+            )
+        },
+        ("dartpy",),
+    ),
     "damaged_input": Campaign(
         "--rounds 40 --seed 5",
         {
