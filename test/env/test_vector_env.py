@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import hashlib
 import warnings
 
 import gymnasium
@@ -108,26 +107,6 @@ def test_it_steps_as_gymnasiums_own_vector_env_of_single_envs(task, mode):
         assert_alike(one[4], another[4])
         ended += int((one[2] | one[3]).sum())
     assert ended >= 9
-
-
-@pytest.mark.parametrize("task", TASKS[1:5])
-def test_a_world_does_not_depend_on_how_many_others_there_are(task):
-    def course(count):
-        env = vector(count, **task)
-        seen = [env.reset(seed=10)[0][:1]]
-        for action in actions_of(vector(1, **task), 60):
-            step = env.step(np.repeat(action, count, axis=0))
-            seen += [part[:1].copy() for part in step[:4]]
-        return digest(seen)
-
-    assert course(1) == course(17)
-
-
-def digest(arrays):
-    found = hashlib.sha256()
-    for array in arrays:
-        found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()
 
 
 def test_threads_change_no_bit_of_what_is_taught():
