@@ -37,7 +37,10 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Start
 from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import qos, wire
-from nics_drl_bridge.nodes.command_types import expect_stamped
+from nics_drl_bridge.nodes.command_types import (
+    describe_deaf_subscribers,
+    expect_stamped,
+)
 from nics_drl_bridge.nodes.listener import POLL_S, SpunNode, ask, spin
 from nics_drl_bridge.nodes.own_process import ENDING
 from nics_drl_bridge.nodes.parameters import is_stamped_default
@@ -208,8 +211,9 @@ class Link(SpunNode):
     ) -> None:
         """Wait until all peers are matched. Raises BackendError naming what is missing."""
         node = self.node
+        commands = self.commands
         needed = dict[str, Callable[[], Any]]()
-        needed[f"subscriber of {self._topic}"] = self.commands.get_subscription_count
+        needed[f"subscriber of {self._topic}"] = commands.get_subscription_count
         for name in map(node.resolve_topic_name, topics):
             needed[f"publisher of {name}"] = partial(node.count_publishers, name)
         for client in clients:
@@ -221,6 +225,10 @@ class Link(SpunNode):
             missing = ", no ".join(
                 name for name, there in needed.items() if not there()
             )
+            deaf = describe_deaf_subscribers(node, self._topic, self.stamped)
+            if deaf and not commands.get_subscription_count():
+                fix = f"set `stamped` to {not self.stamped}, or leave it out."
+                raise BackendError(f"topic {self._topic}: {deaf}; {fix}")
             raise BackendError(
                 f"after {patience_s:g} s there is still no {missing}; {advice}"
             )

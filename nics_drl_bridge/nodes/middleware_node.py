@@ -93,12 +93,17 @@ class MiddlewareNode(ManagedNode):
                 f"rejected data, counted in /diagnostics: {listed}"
             )
         awaited = dict.fromkeys((*self._topics.expected, *health.topics))
+        missing = ""
+        if self._topics.lacks_gyro:
+            missing = "nobody publishes one, though the model was made with it: the wheels turn"
+            self.get_logger().warning(f"imu: {missing}", once=True)
         silent = self._topics.list_silent(awaited, SILENCE_S)
         level = STALE if silent else OK
         message = "receiving" if self.state == ACTIVE else self.state
         if silent:
             message = f"nothing usable on {', '.join(silent)}"
-        return runner.Condition(message, level, health.describe(), self._hardware)
+        shown = health.describe() | ({"imu": missing} if missing else {})
+        return runner.Condition(message, level, shown, self._hardware)
 
 
 main = partial(runner.run_node, MiddlewareNode, sole_name="middleware_node")

@@ -265,11 +265,12 @@ class Operator:
     def _gates(self) -> set[str]:
         """Return the names of all gates that are seen."""
         services = self._node.get_service_names_and_types()
-        return {
+        ends = [
             name.removesuffix("/arm")
             for name, _ in services
             if name.endswith(f"/{GATE}/arm")
-        }
+        ]
+        return set(ends)
 
     def _explain_absence(
         self, what: str, seconds: float, space: str, others: Sequence[str]

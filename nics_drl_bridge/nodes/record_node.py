@@ -23,7 +23,12 @@ from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.command_types import expect_stamped
+from nics_drl_bridge.nodes.command_types import (
+    SETTINGS,
+    describe_deaf_subscribers,
+    expect_stamped,
+    name_of,
+)
 from nics_drl_bridge.nodes.parameters import IMU, STAMPED, list_drive_rows
 from nics_drl_bridge.recording.drive_log import DriveLog
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
@@ -171,12 +176,17 @@ class RecordNode(qos.BridgeNode):
             self._origin_ns = self._now_ns()
             return True
         if time.monotonic() - self._began > PATIENCE_S:
-            name = CMD_VEL
-            reason = f"nobody listened within {PATIENCE_S:g} s"
-            if self._pose is None:
-                name = "odom"
-                reason = f"nothing arrived within {PATIENCE_S:g} s"
+            odom = ("odom", "nothing arrived")
+            command = (CMD_VEL, "nobody listened")
+            name, missing = odom if self._pose is None else command
             fix = "start the robot, or correct namespace, ROS_DOMAIN_ID or remapping."
+            reason = f"{missing} within {PATIENCE_S:g} s"
+            if self._pose is not None and self._topic is not None:
+                deaf = describe_deaf_subscribers(self, CMD_VEL, self._stamped)
+                if deaf:
+                    setting = SETTINGS[name_of(not self._stamped)]
+                    fix = f"set {setting}, or leave it out."
+                    raise BackendError(f"topic {self._place(name)}: {deaf}; {fix}")
             raise BackendError(f"topic {self._place(name)}: {reason}; {fix}")
         return False
 

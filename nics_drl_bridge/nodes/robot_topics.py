@@ -35,7 +35,7 @@ from nics_drl_bridge.nodes.parameters import (
 )
 from nics_drl_bridge.nodes.runner import get_choice, get_flag, get_text
 from nics_drl_bridge.recording import messages
-from nics_drl_bridge.recording.topic_roles import list_imu_topics
+from nics_drl_bridge.recording.topic_roles import IMU_NAMES, list_imu_topics
 
 SILENCE_S = 5.0  # diagnostics call a topic stale that has been silent for this long [s]
 KINDS_OF_POSE = {
@@ -104,6 +104,13 @@ class RobotTopics(Intake):
         made = self._node.create_subscription(kind, topic, locked, quality)
         self._subscriptions.append(made)
 
+    @property
+    def lacks_gyro(self) -> bool:
+        """True if the model was made with a gyro, and nobody publishes one."""
+        return self._may_use_gyro and not any(
+            self._node.count_publishers(topic) for topic in IMU_NAMES
+        )
+
     def _subscribe_imu(self) -> None:
         """Subscribe to the gyro if one is named or the model was made with one."""
         wanted = get_text(self._node, IMU)
@@ -111,7 +118,9 @@ class RobotTopics(Intake):
         self._imu_topic = ""  # the first topic that is heard
         for topic in topics:
             self._subscribe(topic, Imu, partial(self._take_imu_of, topic), qos.SENSOR)
-        if topics and wanted != defaults.IMU_TOPIC:  # those are used if they arrive
+        # those that are not named are used if they arrive
+        self._may_use_gyro = bool(topics) and wanted == defaults.IMU_TOPIC
+        if topics and not self._may_use_gyro:
             self.expected = (*self.expected, measurement.IMU)
             self.expected_topics = (*self.expected_topics, wanted)
 
