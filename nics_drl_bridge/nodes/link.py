@@ -106,6 +106,7 @@ class Link(SpunNode):
             self._timeout = CommandTimeout(
                 self._context, self.commands, self._kind, command_timeout_s
             )
+            INTERRUPTS.watch(self)
         except BaseException:
             self.close()
             raise
@@ -162,6 +163,11 @@ class Link(SpunNode):
         if self._context.ok():
             self._timeout.begin(moving=False)
             self.commands.publish(self._kind())
+
+    def halt_if_moving(self) -> None:
+        """Publish a zero command unless the last one was zero."""
+        if self._timeout.moving:
+            self.halt()
 
     def check_open(self) -> None:
         """Raise BackendError if the link is closed."""
@@ -242,6 +248,46 @@ class Link(SpunNode):
     def close(self) -> None:
         """Publish a zero command and end the node."""
         self._closing()
+        INTERRUPTS.forget(self)
+
+
+class Interrupts:
+    """Halts all open links at Ctrl-C, even between two of their calls.
+
+    The interrupt is then passed on to the previous handler. Halting matters because the process may
+    live on, as in a notebook, and in lock-step no timeout would end the last command.
+    """
+
+    def __init__(self) -> None:
+        self._links: weakref.WeakSet[Link] = weakref.WeakSet()
+        self._before: Any = None
+
+    def watch(self, link: Link) -> None:
+        """Halt a link at Ctrl-C from now on, unless the process ignores or handles it itself."""
+        self._links.add(link)
+        handler = signal.getsignal(signal.SIGINT)
+        in_main = threading.current_thread() is threading.main_thread()
+        if in_main and callable(handler) and handler != self._interrupt:
+            self._before = handler
+            signal.signal(signal.SIGINT, self._interrupt)
+
+    def forget(self, link: Link) -> None:
+        """Stop watching a link that is closed."""
+        self._links.discard(link)
+        last = not self._links and signal.getsignal(signal.SIGINT) == self._interrupt
+        if last and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, self._before)
+
+    def _interrupt(self, number: int, frame: Any) -> None:
+        try:
+            for link in list(self._links):
+                with contextlib.suppress(Exception):  # the others are halted, too
+                    link.halt_if_moving()
+        finally:
+            self._before(number, frame)
+
+
+INTERRUPTS = Interrupts()
 
 
 def _spin(node: Node, timeout: CommandTimeout) -> None:
@@ -275,9 +321,11 @@ class CommandTimeout:
         self._kind = kind
         self._limit_s = limit_s
         self._due_s = self._answered_s = math.inf
+        self.moving = False  # the last command sent was not zero
 
     def begin(self, moving: bool) -> None:
         """Restart the timeout; call it before a command is published, zero or not."""
+        self.moving = moving
         self._due_s = time.monotonic() + self._limit_s if moving else math.inf
 
     def look(self) -> None:

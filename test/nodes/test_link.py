@@ -133,6 +133,7 @@ def test_a_signal_that_would_end_the_program_is_an_exception(number, domain_id):
 @pytest.fixture
 def drive(meet, domain_id):
     """Make a robot drive that a listener has found, `drive(timeout_s)`."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     peer = meet(domain_id)
     heard = peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND)
     made = []
@@ -146,6 +147,14 @@ def drive(meet, domain_id):
     yield start
     for robot in made:
         robot.close()
+    assert signal.signal(signal.SIGINT, before) is signal.default_int_handler
+
+
+def test_ctrl_c_between_two_steps_in_lock_step_leaves_a_zero_behind(drive):
+    _, peer, heard = drive()
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    peer.until(lambda: heard[-1] == Twist(), "a zero command")
 
 
 def test_a_command_that_no_other_one_follows_is_followed_by_a_zero(drive):
