@@ -334,11 +334,29 @@ class PathActions:
         with refuse_config_errors(goal, goal.code):
             path = PlannedPath(poses)
         self._robot_in(goal.name, frame)
+        self._require_on_map(goal, frame, poses)
         arrival, progress = self.parameters.checks(*checks)
         goal_checker = GoalChecker(arrival, not self._robot.steers)
         progress_checker = ProgressChecker(progress)
         now_s = time.monotonic()
         return Run(goal, frame, path, goal_checker, progress_checker, now_s, now_s)
+
+    def _require_on_map(self, goal: Goal, frame: str, poses: Array) -> None:
+        if self._map is None:
+            return
+        wanted, grid = self._map
+        here = self._frames.locate_robot(frame)
+        there = self._frames.locate_robot(wanted)
+        if here is None or there is None:
+            return
+        points = geometry.compose(there, geometry.between(here, poses))[:, :2]
+        cells = grid.world_to_cell(points)
+        off = ((cells < 0) | (cells >= grid.cells.shape)).any(axis=-1)
+        if off.any():
+            k = int(np.argmax(off))
+            x, y = points[k].round(2) + 0.0  # no negative zero
+            why = f"pose {k} of the path, ({x:.2f}, {y:.2f}) m, is off the map; replan it."
+            raise Refusal(goal.code, f"{goal.name}: {why}")
 
     # The robot drives to a goal.
 
