@@ -213,7 +213,7 @@ def test_a_middleware_publishes_its_estimate_only_while_active_and_its_state_alw
     assert robot.diagnose().message == "unconfigured"
     assert not robot.call("~/reset").success
     assert node.trigger_configure() == SUCCESS
-    assert robot.diagnose().message == "nothing usable on scan, odom"
+    assert robot.diagnose().message == "nothing on scan, odom yet"
     hear()
     assert estimates == []
     assert node.trigger_activate() == SUCCESS
