@@ -55,34 +55,3 @@ TEXTS: dict[str, Callable[[Path], object]] = {
     "control characters": _text(lambda whole: whole.rstrip() + b"\ns: \x01\x02\n"),
 }
 """Of YAML files, besides what `test_config` reads."""
-
-VALUES = (
-    "word",
-    "no",
-    "010",
-    "0x1F",
-    "1_000",
-    "12:30",
-    ".nan",
-    ".inf",
-    "-.inf",
-    "-1",
-    "0",
-    "1e300",
-    "-1e300",
-    "1e-300",
-    "99999999999999999999999999",
-    "null",
-    "[]",
-    "{}",
-    "[1, 2]",
-    "[.nan]",
-    "{a: 1}",
-    "true",
-    "''",
-    "'1.0'",
-    "2020-01-01",
-    "1.0 m",
-    "[[[]]]",
-)
-"""Put in the place of any value of a YAML file."""

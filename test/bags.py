@@ -124,6 +124,20 @@ def scan(t: float | None, beams: int = 4, time_increment: float = 0.0) -> Any:
     )
 
 
+def scan_of(
+    lidar: Any, t: float | None, ranges: Any, frame: str = "laser", **changed: float
+) -> Any:
+    """A scan of a lidar; `changed` are values of its header."""
+    values = (lidar.header._asdict() | changed).values()
+    return new(
+        "sensor_msgs/LaserScan",
+        header(t, frame),
+        *map(float, values),
+        np.array(ranges, np.float32),
+        np.zeros(0, np.float32),
+    )
+
+
 def transform(
     t: float | None, place: Iterable[float], frame: str = "world", child: str = "car"
 ) -> Any:

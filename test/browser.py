@@ -23,9 +23,9 @@ needs_chromium = pytest.mark.skipif(
 )
 
 
-def until(condition, what: str):
+def until(condition, what: str, deadline_s: float = DEADLINE_S):
     """The first value of a condition that holds."""
-    deadline = time.monotonic() + DEADLINE_S
+    deadline = time.monotonic() + deadline_s
     while not (found := condition()):
         assert time.monotonic() < deadline, f"never came: {what}"
         time.sleep(0.005)

@@ -51,25 +51,6 @@ def test_it_tells_its_version_and_refuses_another_command_in_one_sentence(tmp_pa
     assert sentence.startswith("nics: No such command 'genrate'")
 
 
-@pytest.mark.process
-def test_the_help_loads_nothing_that_only_commands_need():
-    heavy = {
-        "numba",
-        "scipy",
-        "matplotlib",
-        "gymnasium",
-        "torch",
-        "rclpy",
-        "onnx",
-        "numpy",
-    }
-    code = "import sys, nics_drl_bridge.commands.cli; print(*sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert heavy.isdisjoint(done.stdout.split())
-
-
 def test_generate_makes_a_model_of_a_recording_and_replaces_it(drive, tmp_path):
     words = ("generate", drive, "--robot", "ackermann", "--out", "models/car")
     first = nics(*words, cwd=tmp_path)

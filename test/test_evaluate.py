@@ -40,26 +40,6 @@ def driven(done, folder):
 BASELINE = "evaluate dynamic_window --model differential --episodes 2 --out out"
 
 
-@pytest.mark.ros
-@pytest.mark.process
-@pytest.mark.slow
-@needs_nodes
-def test_the_same_episodes_are_driven_by_other_physics_over_dds(tmp_path, domain_id):
-    done = nics(BASELINE, "--in fast --in mujoco_dds", cwd=tmp_path)
-    places = driven(done, tmp_path)["policies"]["dynamic_window"]
-    for figures in places.values():
-        assert [one["seed"] for one in figures["each"]] == [1_000_000, 1_000_001]
-        assert figures["episodes"] == 2
-    fast, mujoco = places.values()
-    assert 0.001 < mujoco["greatest_deviation"] < 1.0  # another machine, the same road
-    assert [one["goal"] for one in fast["each"]] == [
-        one["goal"] for one in mujoco["each"]
-    ]
-    picture = tmp_path / "out" / "trajectories_dynamic_window.png"
-    assert picture.read_bytes().startswith(PNG)
-    assert "dynamic_window: success in process " in done.stdout.splitlines()[-2]
-
-
 def test_an_evaluation_in_the_folder_of_another_says_that_it_replaces_it(tmp_path):
     words = "evaluate straight --in fast --episodes 1 --world empty --out out"
     first, second = (nics(words, cwd=tmp_path) for _ in range(2))
@@ -72,7 +52,7 @@ def test_an_evaluation_in_the_folder_of_another_says_that_it_replaces_it(tmp_pat
 @pytest.mark.process
 @pytest.mark.slow
 @needs_nodes
-def test_lidar_randomisation_and_gate_are_the_same_in_process_and_over_dds(
+def test_the_same_episodes_are_driven_in_process_over_dds_and_by_other_physics(
     tmp_path, domain_id
 ):
     conditions = {
@@ -81,15 +61,25 @@ def test_lidar_randomisation_and_gate_are_the_same_in_process_and_over_dds(
         "gate": "differential",
     }
     words = [f"--{name}={value}" for name, value in conditions.items()]
-    done = nics(BASELINE, *words, "--in fast --in dds", cwd=tmp_path)
+    places = "--in fast --in dds --in mujoco_dds"
+    done = nics(BASELINE, *words, places, cwd=tmp_path)
     told = driven(done, tmp_path)
     others = {"steps": 300, "task": {}, "kind": None}
     assert told["conditions"] == conditions | others
-    fast, dds = told["policies"]["dynamic_window"].values()
+    figures = told["policies"]["dynamic_window"].values()
+    fast, dds, mujoco = figures
+    for place in figures:
+        assert [one["seed"] for one in place["each"]] == [1_000_000, 1_000_001]
+        assert [one["goal"] for one in place["each"]] == [
+            one["goal"] for one in fast["each"]
+        ]
     assert dds["same"] == 1.0
     assert dds["greatest_deviation"] < 1e-6  # the same numbers, by way of messages
-    results = [[one["result"] for one in place["each"]] for place in (fast, dds)]
-    assert results[0] == results[1]
+    assert mujoco["greatest_deviation"] > 0.001  # another machine, the same goals
+    assert all(one["result"] == "success" for one in mujoco["each"])
+    picture = tmp_path / "out" / "trajectories_dynamic_window.png"
+    assert picture.read_bytes().startswith(PNG)
+    assert "dynamic_window: success in process " in done.stdout
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from fnmatch import fnmatch
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -59,9 +60,9 @@ HOMES = {
     "mujoco": ("extras/mujoco/*",),
     "dartpy": ("extras/dart/*",),
     "tensorboard": ("policy/train/*",),
-    "torch": ("policy/train/*", "extras/ray/*"),
-    "stable_baselines3": ("policy/train/*", "extras/ray/*"),
-    "onnx": ("policy/*", "extras/foreign_policies/*"),
+    "torch": ("extras/ray/*", "extras/sb3/*"),
+    "stable_baselines3": ("policy/train/*", "extras/sb3/*"),
+    "onnx": ("policy/*", "extras/foreign_policies/*", "extras/sb3/*"),
     "onnxruntime": ("policy/*",),
     "safetensors": ("extras/foreign_policies/*",),
     "pettingzoo": ("env/pettingzoo_env.py",),
@@ -153,13 +154,50 @@ def test_imports_run_one_way_and_each_library_is_imported_at_its_home_only():
     assert wrong_directions(imports) + strangers(imports) == []
 
 
-def modules_after(code: str) -> set[str]:
-    """The modules that are loaded in a fresh process after some code."""
+ENV = f"""
+from {PACKAGE}.env.bridge_env import BridgeEnv
+env = BridgeEnv(backend="sim")
+env.reset(seed=0)
+env.step(env.action_space.sample())
+env.close()
+"""
+SLOW = "numba scipy matplotlib gymnasium torch rclpy"
+ROS = pytest.mark.ros(
+    pytest.mark.skipif(find_spec("rclpy") is None, reason="needs ROS 2")
+)
+
+
+@pytest.mark.process
+@pytest.mark.timeout(300)  # without numba's caches, all kernels are compiled here
+@pytest.mark.parametrize(
+    ("code", "needed", "heavy"),
+    [
+        (f"import {PACKAGE}", PACKAGE, f"{SLOW} numpy pydantic filterpy"),
+        (f"import {PACKAGE}.commands.cli", "typer", f"{SLOW} numpy onnx"),
+        pytest.param(
+            f"import {PACKAGE}.nodes.command_gate",
+            "rclpy",
+            "gymnasium matplotlib onnx onnxruntime scipy.linalg scipy.ndimage scipy.stats "
+            "stable_baselines3 torch",
+            marks=ROS,
+        ),
+        pytest.param(
+            ENV,
+            "numba",
+            "dartpy geometry_msgs matplotlib mujoco rclpy scipy.signal sensor_msgs typer",
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["package", "help", "gate", "env"],
+)
+def test_what_starts_loads_nothing_that_it_does_not_need(code, needed, heavy):
     ask = f"import sys\n{code}\nprint(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", ask], capture_output=True, text=True, check=True
     )
-    return set(done.stdout.split())
+    loaded = set(done.stdout.split())
+    assert needed in loaded
+    assert not loaded & set(heavy.split())
 
 
 LIGHT = {
@@ -196,58 +234,6 @@ def test_kernels_import_kernels_only_so_that_no_other_edit_compiles_them_anew():
         } - LIGHT
         heavy[str(path)] = {name for name in others if not name.endswith("kernels.py")}
     assert {name: found for name, found in heavy.items() if found} == {}
-
-
-@pytest.mark.process
-def test_importing_the_package_imports_nothing_heavy():
-    loaded = modules_after(f"import {PACKAGE}")
-    assert PACKAGE in loaded
-    heavy = {
-        "numpy",
-        "numba",
-        "scipy",
-        "gymnasium",
-        "matplotlib",
-        "pydantic",
-        "filterpy",
-        "torch",
-    }
-    assert not loaded & (heavy | {"rclpy"})
-
-
-@pytest.mark.process
-@pytest.mark.ros
-def test_the_gate_loads_nothing_that_is_slow_learns_or_infers():
-    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-    loaded = modules_after(f"import {PACKAGE}.nodes.command_gate")
-    assert "rclpy" in loaded
-    assert not loaded & {"scipy.linalg", "scipy.ndimage", "scipy.stats", "matplotlib"}
-    assert not loaded & {"torch", "onnx", "onnxruntime", "stable_baselines3"}
-    assert "gymnasium" not in loaded
-
-
-@pytest.mark.process
-@pytest.mark.slow
-@pytest.mark.timeout(300)  # without numba's caches, all kernels are compiled here
-def test_an_env_in_process_imports_neither_ros_nor_pictures_nor_slow_libraries():
-    loaded = modules_after(
-        "from nics_drl_bridge.env.bridge_env import BridgeEnv\n"
-        "env = BridgeEnv(backend='sim')\n"
-        "env.reset(seed=0)\n"
-        "env.step(env.action_space.sample())\n"
-        "env.close()"
-    )
-    assert {PACKAGE, "gymnasium", "numba"} <= loaded
-    assert not loaded & {
-        "rclpy",
-        "sensor_msgs",
-        "geometry_msgs",
-        "matplotlib",
-        "typer",
-        "mujoco",
-        "dartpy",
-        "scipy.signal",
-    }
 
 
 @pytest.mark.parametrize(

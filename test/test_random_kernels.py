@@ -64,27 +64,6 @@ def test_normals_by_the_thousand_are_standard_normal_far_out_too(thousands):
             assert tail.sum() == pytest.approx(expected, abs=4.0 * np.sqrt(expected))
 
 
-def test_sums_of_two_numbers_of_the_pool_are_standard_normal_within_a_50000th():
-    pool = random.POOL[: random.POOL_SIZE].astype(np.int64)
-    often = np.bincount(pool - pool.min()) / random.POOL_SIZE
-    chance = np.convolve(often, often)
-    drawn = (np.arange(chance.size) + 2 * pool.min()) * random.PER_STD
-    below = np.cumsum(chance) - 0.5 * chance
-    assert np.abs(below - stats.norm.cdf(drawn)).max() < 2e-5
-    assert (chance * drawn).sum() == pytest.approx(0.0, abs=1e-4)
-    assert (chance * drawn**2).sum() == pytest.approx(1.0, abs=1e-4)
-    assert 2 * max(pool.max(), -pool.min()) < 2**15  # the sum of two
-    assert 5.0 < drawn.max() < 6.2
-    assert np.array_equal(random.POOL[-random.RUN :], random.POOL[: random.RUN])
-
-
-@pytest.mark.slow
-def test_signs_of_draws_are_independent_of_each_other_and_of_their_sizes(thousands):
-    sample = thousands[..., :1056].reshape(-1, random.RUN)
-    apart = np.corrcoef(sample, rowvar=False)[np.triu_indices(random.RUN, 1)]
-    assert np.abs(apart).max() < 5.0 / np.sqrt(len(sample))
-
-
 @pytest.mark.slow
 def test_bits_of_a_key_are_uniform_and_hardly_repeat():
     @njit

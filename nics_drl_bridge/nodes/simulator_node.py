@@ -51,7 +51,7 @@ from nics_drl_bridge.recording.messages import get_stamp, read_command
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
 from nics_drl_bridge.sim.occupancy import occupancy, standing
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import require_inside
+from nics_drl_bridge.sim.world import check_inside
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 CLOCK = "/clock"
@@ -501,7 +501,7 @@ class DeviceNode(qos.BridgeNode):
         logger = self.get_logger()
         try:
             pose = read_initial_pose(message, self.map_frame)
-            require_inside(self.device.world, pose)
+            check_inside("the pose", self.device.world, pose[0], pose[1])
         except ConfigError as error:
             logger.error(f"{INITIAL_POSE}: {error} The robot stays where it is.")
             return

@@ -12,7 +12,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.arrays import Array, Integers, Singles
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import World, measure_clearance
+from nics_drl_bridge.sim.world import World, check_inside
 
 
 @dataclass(frozen=True)
@@ -25,14 +25,8 @@ class Sensed:
     state: Array  # (S,) true state
     ranges: Singles  # (B,) scan
     pose: Array  # (3,) true pose in `map`
-    before: Array  # (3,) true pose one step earlier
-    period: float  # length of a step [s]
+    true_twist: Array  # (3,) mean true body twist over the last step
     readings: Mapping[str, Singles]  # name -> (S,) of each further sensor
-
-    @property
-    def true_twist(self) -> Array:
-        """(3,) mean true body twist over the last step."""
-        return geometry.log(geometry.between(self.before, self.pose)) / self.period
 
 
 class DeviceWorld:
@@ -78,11 +72,7 @@ class DeviceWorld:
         def arranged(scenes: Scenes) -> Array | None:
             world = self.simulator.world.members[int(scenes.member[0])]
             for x, y, _ in [] if placed is None else placed[0].tolist():
-                if measure_clearance(world, x, y) < 0.0:
-                    raise ConfigError(
-                        f"episode_start: ({x:g}, {y:g}) m lies outside the world "
-                        f"{world.name!r}; move it inside."
-                    )
+                check_inside("episode_start", world, x, y)
             return self.arrange(scenes, placed)
 
         self.simulator.reset([seed], starts=arranged)
@@ -92,15 +82,14 @@ class DeviceWorld:
 
     def exchange(self, simulator: FastSimulator, kept: Integers) -> None:
         """Continue in another simulator, whose first robots are `kept` here."""
-
-        def moved(old: Array, new: Array) -> Array:
-            new[: len(kept)] = old[kept]
-            return new
-
         robots = simulator.data.pose.shape[1]
+        commands = np.zeros((robots, self.commands.shape[1]))
+        commands[: len(kept)] = self.commands[kept]
+        covariance = np.tile(self._added, (robots, 1, 1))
+        covariance[: len(kept)] = self._covariance[kept]
         self.simulator = simulator
-        self.commands = moved(self.commands, np.zeros((robots, self.commands.shape[1])))
-        self._covariance = moved(self._covariance, np.tile(self._added, (robots, 1, 1)))
+        self.commands = commands
+        self._covariance = covariance
         self._before = simulator.data.pose[0].copy()
 
     @property
@@ -125,6 +114,7 @@ class DeviceWorld:
     def sensed(self, robot: int) -> Sensed:
         """Return the current values of one robot; the next step may overwrite them."""
         data = self.simulator.data
+        moved = geometry.between(self._before[robot], data.pose[0, robot])
         readings = {
             name: values[0, robot] for name, values in self.simulator.readings.items()
         }
@@ -135,8 +125,7 @@ class DeviceWorld:
             data.state[0, robot],
             data.ranges[0, robot],
             data.pose[0, robot],
-            self._before[robot],
-            self._period,
+            geometry.log(moved) / self._period,
             readings,
         )
 

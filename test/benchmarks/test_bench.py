@@ -190,17 +190,6 @@ def test_nothing_measured_and_a_failure_that_is_told_miss_their_bars():
     assert missed == ["robots: nothing was measured", "failed: no lidar"]
 
 
-def test_only_figures_that_a_table_shows_are_kept():
-    import bench
-
-    result = {"a": {"b": [{"c": 1, "d": 2}, {"c": 3}]}, "e": [4, 5], "f": 6}
-    paths = (("a", "b", "*", "c"), ("e", "1"))
-    assert bench.keep_figures(result, paths) == {
-        "a": {"b": {"0": {"c": 1}, "1": {"c": 3}}},
-        "e": {"1": 5},
-    }
-
-
 ENTRY = {
     "script": "parity.py",
     "machine": {"cores": 2, "cpu": "Zuse Z3", "memory_gb": 24.7, "python": "3.11.7"},
@@ -271,20 +260,6 @@ def test_a_table_shows_what_is_wrong_with_its_runs():
     assert "† `parity.py` broken: was ended" in broken
     quiet = page(**missed).table(Table(table.head, table.rows, notes=False))
     assert quiet.endswith("| rate | 4.9e5† |\n| | x |\n")
-
-
-def test_machine_commit_and_load_are_told_and_another_machine_is_marked():
-    from figures import Page, Table
-
-    told = page(dirty=True).text("machine")
-    for words in ("2 shared cores (Zuse Z3) with 25 GB", "789ab and changes", "1.5 to"):
-        assert words in told
-    away = {**ENTRY, "machine": {**ENTRY["machine"], "cpu": "Analytical Engine"}}
-    found = Page({"parity": ENTRY, "soak": ENTRY, "shield": away})
-    table = Table(("",), (("parity", "{rate:.0e}"), ("shield", "{rate:.0e}")))
-    note = "§ on 2 shared cores (Analytical Engine)\n"
-    assert found.table(table) == f"| |\n|---|\n| 5e5 |\n| 5e5§ |\n\n{note}"
-    assert "where marked §" in found.text("machine")
 
 
 def test_a_region_is_made_anew_and_all_else_stays(monkeypatch):

@@ -66,12 +66,6 @@ def test_the_last_world_counts_on_from_the_seed_of_the_first():
         made("vector").reset(seed=2**63 - 2)
 
 
-@pytest.mark.parametrize("bad", [2**63, "x", 1.5])
-def test_a_list_of_seeds_is_checked_one_by_one(bad):
-    with pytest.raises(ConfigError, match=r"^seed "):
-        made("vector").reset(seed=[1, bad, None])
-
-
 def test_reset_mask_is_an_option_of_the_vector_env_alone():
     with pytest.raises(ConfigError, match="unknown reset option 'reset_mask'"):
         made("single").reset(options={"reset_mask": np.array([True])})

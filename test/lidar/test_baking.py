@@ -10,7 +10,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.bake import add_shapes, bake
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle
-from nics_drl_bridge.lidar.table import Density, LidarTable, count_padding
+from nics_drl_bridge.lidar.table import Density, LidarTable
 
 SPEC = lidar(beams=360, range_min=0.0)
 SMALL = Density(distances=12, rotations=16)
@@ -52,14 +52,6 @@ def test_equal_shapes_are_baked_once_and_circles_at_one_rotation():
     assert table.grid[:, 1].tolist() == [4.0, 1.0]  # a quarter of 16; none
 
 
-def test_rows_lie_apart_within_the_table_and_leave_room_at_its_end():
-    table = bake(SPEC, (SQUARE, STRIP), SMALL)
-    ends = table.start + table.cell[:, 1].astype(int) * table.density.phases
-    assert table.start[0] == 0
-    assert np.array_equal(table.start[1:], ends[:-1])
-    assert len(table.rows) == ends[-1] + count_padding(SPEC.angle_increment)
-
-
 @pytest.mark.parametrize(
     "make", [partial(bake, density=SMALL), LidarTable.without_rows]
 )
@@ -75,13 +67,6 @@ def test_a_table_that_no_index_can_reach_is_refused(monkeypatch):
     monkeypatch.setattr("nics_drl_bridge.lidar.bake.MOST_NUMBERS", 1000)
     with pytest.raises(ConfigError, match="is too large; lower `distances`"):
         bake(SPEC, [SQUARE], Density(distances=50, rotations=40))
-
-
-def test_the_points_of_a_row_are_near_each_other_whatever_the_beams():
-    beams = [2048, 720, 360, 180, 90, 36, 1]
-    phases = [Density.for_beams(2.0 * np.pi / count).phases for count in beams]
-    assert phases == [1, 1, 2, 4, 8, 8, 8]
-    assert bake(lidar(beams=180), [SQUARE]).density.phases == 4
 
 
 def test_a_shape_that_covers_more_beams_than_a_row_has_is_refused_with_the_way_out():

@@ -63,10 +63,6 @@ def test_the_distance_field_is_the_distance_to_the_nearest_square():
         assert room.distance_field == pytest.approx(expected, abs=1e-6)
 
 
-def test_without_anything_blocked_the_distance_is_infinite():
-    assert np.isinf(grid(["..", ".."]).distance_field).all()
-
-
 def test_the_distance_field_of_a_large_map_takes_few_bytes_for_a_cell():
     """A few kilobytes of PNG hold millions of cells, whose distances the first scene needs."""
     side = 1000

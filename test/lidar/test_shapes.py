@@ -6,12 +6,10 @@ import shapely
 from lidar_scenes import POLYGONS, random_shapes
 from pydantic import ValidationError
 
-from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.lidar.shapes import (
     SQUARE,
     STRIP,
     Circle,
-    Outlines,
     Polygon,
     Rectangle,
     Segment,
@@ -89,22 +87,6 @@ def test_how_often_a_shape_looks_the_same_in_a_turn(shape, order):
     assert order % find_rotational_order(outline, hull) == 0
     if order > 2 or shape is STRIP:
         assert find_rotational_order(outline, hull) == order
-
-
-def test_outlines_hold_all_shapes_one_after_the_other():
-    shapes = (Circle(radius=0.1), SQUARE, regular(5))
-    outlines = Outlines.of(shapes)
-    assert outlines.corner.tolist() == [0, 0, 4, 9]
-    assert outlines.hull.tolist() == [0, 2, 10, 20]
-    assert np.array_equal(outlines.corners[:4], SQUARE.outline)
-    assert np.array_equal(outlines.hulls[2:6], outlines.hulls[6:10])
-    assert outlines.orders.tolist() == [1, 4, 5]
-    assert [outlines.index_of(shape) for shape in shapes] == [0, 1, 2]
-    with pytest.raises(
-        ModelError, match=r"rectangle of 0.6 x 0.06 m is not in .* bake it as well"
-    ):
-        outlines.index_of(STRIP)
-    assert Outlines.of(()).corners.shape == (0, 2)
 
 
 def test_every_shape_is_read_back_from_plain_data_and_has_a_description():

@@ -305,17 +305,6 @@ def test_the_way_goes_on_from_a_pose_that_was_measured_in_between(heading):
     assert estimator.look_ahead(PERIOD)[0] == pytest.approx(ahead, abs=0.01)
 
 
-def test_a_twist_is_weighed_as_filterpy_weighs_it():
-    estimator = driven()
-    expected, derivative = estimator._predict_measurement(Kind.TWIST)
-    noise = estimator._noise[Kind.TWIST]
-    weight, covariance = kernels.compute_update(estimator.covariance, derivative, noise)
-    own = estimator._filter
-    own.update(expected, lambda _: derivative, lambda _: expected, R=noise)
-    np.testing.assert_allclose(weight, own.K, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(covariance, own.P, rtol=1e-9, atol=1e-15)
-
-
 def driven(robot="ackermann", seconds=2):
     """An estimator of a robot that drives as it should, at the end."""
     estimator = Estimator(builtin_model(robot))

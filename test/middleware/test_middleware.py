@@ -12,7 +12,7 @@ from robots import direct_model
 
 from middleware.rig import PERIOD, RANGES, SECOND, STILL, assert_same, state
 from nics_drl_bridge.generator import builtin_model, save_model
-from nics_drl_bridge.middleware.middleware import Middleware, TopicCache
+from nics_drl_bridge.middleware.middleware import Middleware
 
 
 def test_a_pose_that_is_set_stays_when_the_next_odometry_comes():
@@ -220,17 +220,6 @@ def test_a_covariance_of_zeros_means_that_of_the_model(middleware):
     middleware.pose(2 * SECOND, 0, [1.01, 2.0, 0.5], np.zeros((3, 3)))
     other.pose(2 * SECOND, 0, [1.01, 2.0, 0.5])
     assert_same(state(middleware), state(other))
-
-
-def test_a_cache_keeps_the_newest_of_each_topic():
-    cache = TopicCache()
-    assert cache.age_s("scan", 5) == np.inf
-    kept = [cache.put("scan", stamp, stamp + 1, stamp) for stamp in (5, 5, 3, SECOND)]
-    assert kept == [True, False, False, True]
-    assert cache.put("odom", 4, 0, None)
-    assert cache.newest["scan"] == (SECOND, SECOND + 1, 1, SECOND)
-    assert cache.newest["odom"].sequence == 0
-    assert cache.age_s("scan", 5 * SECOND // 2) == pytest.approx(1.5)
 
 
 def test_data_of_a_sensor_whose_clock_is_off_do_not_move_that_of_the_robot(middleware):

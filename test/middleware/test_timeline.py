@@ -118,15 +118,6 @@ def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order():
     assert other.replayed > 100
 
 
-def test_any_order_of_one_seconds_data_gives_the_same_estimate():
-    model = builtin_model("ackermann")
-    rng = np.random.default_rng(100)
-    drive = messages(model, rng, seconds=0.9)
-    _, expected = numbers(fed(model, drive))
-    shuffled = [drive[k] for k in rng.permutation(len(drive))]
-    assert numbers(fed(model, shuffled))[1] == pytest.approx(expected, abs=1e-9)
-
-
 @pytest.fixture
 def timeline():
     estimator = Estimator(builtin_model("ackermann"))

@@ -376,7 +376,7 @@ def test_an_initial_pose_puts_the_robot_there_unless_it_can_not_be_used(
     assert simulated.pose() == pytest.approx([0.4, -2.2, 1.0], abs=0.01)
     assert simulated.pose("odom") == pytest.approx(before, abs=0.05)  # it goes on
     for wrong, sentence in (
-        (put_at(9.0, 0.0, 0.0, "site"), "x 9 m, y 0 m is outside the world"),
+        (put_at(9.0, 0.0, 0.0, "site"), "(9, 0) m lies outside the world"),
         (put_at(0.0, 0.0, 0.0, "kitchen"), "in the frame 'kitchen' is refused"),
         (put_at(math.nan, 0.0, 0.0, "site"), "an invalid pose is refused"),
     ):

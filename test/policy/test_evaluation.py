@@ -20,7 +20,6 @@ from nics_drl_bridge.policy.evaluation import (
     ELSEWHERE,
     Episode,
     Outcomes,
-    deviation,
     drive,
     drive_all,
     drive_worlds,
@@ -156,12 +155,6 @@ def test_where_no_truth_is_known_what_the_robot_believes_counts_and_it_is_said()
 
 def test_a_task_without_a_goal_of_each_robot_is_not_judged_by_places():
     assert judged(task=object(), **at(9.0)).result == "success"
-
-
-def test_deviation_is_the_greatest_distance_over_the_common_steps():
-    one = episode([[0, 0], [1, 0], [2, 0]])
-    other = episode([[0, 0], [1, 0.3], [2, 0.1], [9, 9]])
-    assert deviation(one, other) == deviation(other, one) == pytest.approx(0.3)
 
 
 def drive_ever_faster(seen, state):

@@ -13,7 +13,7 @@ from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.policy.planners.mppi import Mppi
-from nics_drl_bridge.policy.planners.mppi_kernels import draw, fit_command
+from nics_drl_bridge.policy.planners.mppi_kernels import fit_command
 from nics_drl_bridge.robot.spec import load_robot
 
 ROBOTS = ("ackermann", "differential", "mecanum", "tricycle")
@@ -41,19 +41,6 @@ def test_an_action_follows_from_seed_and_observation_whatever_was_asked_before_a
     assert np.array_equal(policy.act(seen[::-1])[::-1], actions)
     assert np.array_equal(planner(samples=32).act(seen[7]), actions[7])
     assert not np.array_equal(planner(samples=32, seed=1).act(seen), actions)
-
-
-def test_offers_span_the_range_begin_with_rest_and_half_of_them_hold_one_action():
-    offers, noise = np.empty((2, 200, 4, 2))
-    draw(offers, noise, np.array([-1.0, 0.25]), 3)
-    assert (offers[0] == [-1.0, 0.25]).all()
-    assert offers.min() == -1.0
-    assert offers.max() == 1.0
-    held = (offers == offers[:, :1]).all(axis=(1, 2))
-    assert held[:100].all()
-    assert not held[100:].any()
-    assert noise.mean() == pytest.approx(0.0, abs=0.1)
-    assert noise.std() == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import base64
 import pickle
-import subprocess
-import sys
 
 import numpy as np
 import onnx
@@ -208,6 +206,7 @@ REFUSED = {
     "pickle": (lambda _: pickle.dumps({"weights": [1.0]}), "file"),
     "zip of Stable-Baselines3": (lambda _: b"PK\x03\x04" + bytes(99), "file"),
     "text": (lambda _: b"format: policy\n" * 20, "file"),
+    "too large": (lambda _: bytes(onnx_graph.SIZE_LIMIT + 1), "file"),
 }
 REFUSED_STATES = {
     "none": (contract("state"), "graph.inputs"),
@@ -233,25 +232,6 @@ def test_a_spoilt_file_is_refused_and_the_field_named(
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.slow
-def test_a_flipped_bit_anywhere_is_refused(file, tmp_path):
-    whole = file.read_bytes()
-    rng = np.random.default_rng(4)
-    path = tmp_path / "flipped.onnx"
-    last = len(onnx_graph.add_seal(b""))
-    # some bytes of the checksum, and of the rest
-    places = [
-        *range(len(whole) - last, len(whole), 5),
-        *rng.integers(len(whole) - last, size=20),
-    ]
-    for place in places:
-        data = bytearray(whole)
-        data[place] ^= 1 << rng.integers(8)
-        path.write_bytes(bytes(data))
-        with pytest.raises(PolicyError):
-            load_policy(path)
-
-
 def test_a_file_without_its_checksum_or_with_an_addition_is_refused(file, tmp_path):
     path = tmp_path / "changed.onnx"
     path.write_bytes(onnx.load(file).SerializeToString())
@@ -265,14 +245,6 @@ def test_a_file_without_its_checksum_or_with_an_addition_is_refused(file, tmp_pa
         path.write_bytes(data)
         with pytest.raises(PolicyError, match=r"field '(file|sha256)'"):
             load_policy(path)
-
-
-def test_a_file_that_is_too_large_is_refused(tmp_path):
-    path = tmp_path / "large.onnx"
-    with path.open("wb") as large:
-        large.truncate(onnx_graph.SIZE_LIMIT + 1)
-    with pytest.raises(PolicyError, match="more than the 32 MB"):
-        load_policy(path)
 
 
 def test_an_observation_without_the_state_that_a_policy_needs_is_refused(
@@ -356,25 +328,3 @@ def test_a_policy_of_beams_needs_the_very_lidar(tmp_path):
     policy.make_task(model_of())
     with pytest.raises(PolicyError, match=r"field 'lidar\.beams'"):
         policy.check_fits(model_of(beams=144))
-
-
-BLOCKED = """
-import sys
-class Block:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in ("torch", "stable_baselines3", "mujoco", "tensorboard"):
-            raise ImportError(name + " is not to be imported")
-sys.meta_path.insert(0, Block())
-"""
-
-
-@pytest.mark.process
-def test_it_loads_where_nothing_of_training_is_installed(file):
-    code = (
-        "from nics_drl_bridge.policy.file.policy_file import load_policy\n"
-        f"print(load_policy({str(file)!r}).contract.robot.name)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", BLOCKED + code], capture_output=True, text=True
-    )
-    assert done.stdout.strip() == "direct", done.stderr

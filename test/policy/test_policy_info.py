@@ -24,12 +24,3 @@ def test_nics_policy_info_tells_what_a_file_is_for_people_and_programs(tmp_path)
     assert facts["scan"]["sectors"] == SECTORS
     assert facts["graph_sha256"] == policy.contract.graph_sha256
     assert facts["provenance"] == {"command": "a test", "seed": 3}
-
-
-def test_nics_policy_info_refuses_in_one_sentence(tmp_path):
-    path = tmp_path / "go.onnx"
-    path.write_bytes(b"\x80\x04K\x01.")
-    done = info(path)
-    assert done.returncode == 2
-    (sentence,) = done.stderr.splitlines()
-    assert sentence.startswith(f"nics: {path}: field 'file': is a pickle")

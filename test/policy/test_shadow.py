@@ -27,27 +27,6 @@ PERIOD = 0.1
 LATE = {"/odom": 0.005, "/scan": 0.01, "/cmd_vel": 0.02}
 
 
-def scan(t, ranges, lidar=LIDAR):
-    fields = [float(value) for value in lidar.header]
-    ranges = np.array(ranges, np.float32)
-    return bags.new(
-        "sensor_msgs/msg/LaserScan",
-        bags.header(t, "laser"),
-        *fields,
-        ranges,
-        np.zeros(0, np.float32),
-    )
-
-
-def odometry(t, pose, twist):
-    zeros = np.zeros(36)
-    where = bags.new("geometry_msgs/PoseWithCovariance", bags.pose(*pose), zeros)
-    speed = bags.new("geometry_msgs/TwistWithCovariance", bags.twist(*twist), zeros)
-    return bags.new(
-        "nav_msgs/msg/Odometry", bags.header(t, "odom"), "base_link", where, speed
-    )
-
-
 def driven_by(name):
     """Goal and messages of an episode that a policy drives with the estimator."""
     env = BridgeEnv(model="ackermann", world="circles", estimator=True)
@@ -62,8 +41,8 @@ def driven_by(name):
         action = policy.act(observation)
         twist = ROBOT.to_cmd_vel(env.task.command(action))
         told = {
-            "/scan": scan(t, data.ranges[0, 0]),
-            "/odom": odometry(t, data.odom[0, 0], data.twist[0, 0]),
+            "/scan": bags.scan_of(LIDAR, t, data.ranges[0, 0]),
+            "/odom": bags.moving_odometry(t, data.odom[0, 0], data.twist[0, 0]),
             "/cmd_vel": bags.twist_stamped(t, *twist),
         }
         for topic, message in told.items():
@@ -199,8 +178,8 @@ def driven_standing():
     free = np.full(LIDAR.beams, 2.0)
     moments = [PERIOD * k for k in range(1, 8)]
     return {
-        "/scan": [(t + LATE["/scan"], scan(t, free)) for t in moments],
-        "/odom": [(t, odometry(t, np.zeros(3), np.zeros(3))) for t in moments],
+        "/scan": [(t + LATE["/scan"], bags.scan_of(LIDAR, t, free)) for t in moments],
+        "/odom": [(t, bags.odometry(t, *np.zeros(3))) for t in moments],
         "/cmd_vel": [(t, bags.twist(0.0, 0.0, 0.0)) for t in moments],
     }
 

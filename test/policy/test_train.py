@@ -155,22 +155,12 @@ def test_a_little_training_reaches_more_goals_than_none(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path):
+def test_a_checkpoint_of_another_training_is_refused(tmp_path):
     train(settings(steps=128), 0, tmp_path)
     with pytest.raises(ConfigError, match=r"was trained with hidden \[16\], not \[8\]"):
         train(settings(steps=128, hidden=[8]), 0, tmp_path, resumed=True)
     with pytest.raises(ConfigError, match="has seed 0, not 4"):
         train(settings(steps=128), 4, tmp_path, resumed=True)
-    path = tmp_path / CHECKPOINT
-    whole = path.read_bytes()
-    flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 1
-    for damaged in (whole[:-500], bytes(flipped), whole[:-71]):
-        path.write_bytes(damaged)
-        with pytest.raises(
-            ConfigError, match="is not a training checkpoint, or is damaged"
-        ):
-            read_checkpoint(path)
 
 
 @pytest.mark.parametrize("resumed", [False, True])
@@ -181,11 +171,6 @@ def test_a_folder_with_a_checkpoint_of_an_earlier_version_is_refused(tmp_path, r
     order = TrainOrder(settings(), [3], tmp_path, episodes=1, resumed=resumed)
     with pytest.raises(ConfigError, match="is a checkpoint of an earlier version"):
         run(order)
-
-
-class Harmful:
-    def __reduce__(self):
-        return (open, ("harm", "w"))
 
 
 def pack(text="{}", save=np.savez, **arrays):
@@ -215,10 +200,6 @@ WRONG_CONTENTS = {
     "an array that is not there": lambda: pack(
         json.dumps({"items": [["format", FORMAT], ["x", {"array": "x"}]]})
     ),
-    "code": lambda: pack(
-        json.dumps({"items": [["format", {"array": "x"}]]}),
-        x=np.array([Harmful()], object),
-    ),
     "an array without its numbers": enlarge,
     "deep words": lambda: pack("[" * 100_000),
     "packed": lambda: pack(save=np.savez_compressed),
@@ -226,13 +207,11 @@ WRONG_CONTENTS = {
 
 
 @pytest.mark.parametrize("name", WRONG_CONTENTS)
-def test_a_checkpoint_that_holds_something_else_is_refused(tmp_path, monkeypatch, name):
-    monkeypatch.chdir(tmp_path)
+def test_a_checkpoint_that_holds_something_else_is_refused(tmp_path, name):
     path = tmp_path / CHECKPOINT
     path.write_bytes(seal(WRONG_CONTENTS[name]()))
     with pytest.raises(ConfigError, match="is not a training checkpoint"):
         read_checkpoint(path)
-    assert not (tmp_path / "harm").exists()
 
 
 def test_sac_is_refused_for_discrete_actions_and_a_batch_that_no_rollout_fills(

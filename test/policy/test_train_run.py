@@ -4,11 +4,10 @@ import json
 import signal
 import subprocess
 import sys
-import time
-from importlib.util import find_spec
 
 import filelock
 import pytest
+from browser import until
 from typer.testing import CliRunner
 
 from nics_drl_bridge.commands.cli import app
@@ -59,20 +58,10 @@ def settings(tmp_path):
 def no_torch(monkeypatch):
     """PyTorch and Stable-Baselines3 are not installed."""
     for name in [*sys.modules]:
-        if name.endswith((".policy.train.sb3", ".policy.train.vec_env")):
+        if name.endswith((".extras.sb3.training", ".policy.train.vec_env")):
             monkeypatch.delitem(sys.modules, name)
     for name in ("torch", "stable_baselines3"):
         monkeypatch.setitem(sys.modules, name, None)
-
-
-def test_stable_baselines3_is_asked_for_by_the_name_of_its_extra(
-    tmp_path, settings, no_torch
-):
-    done = nics("--settings", settings, "--engine", "sb3", "--out", tmp_path / "run")
-    assert done.exit_code == 2
-    words = " ".join(done.output.split())
-    assert "pip install 'nics_drl_bridge[sb3]'" in words
-    assert not (tmp_path / "run" / "settings.yaml").exists()
 
 
 @pytest.mark.slow
@@ -226,15 +215,6 @@ def test_a_training_beside_another_in_one_folder_is_refused(tmp_path, settings):
     assert nics("--settings", settings, "--episodes", 2, "--out", out).exit_code == 0
 
 
-@pytest.mark.skipif(find_spec("ray") is not None, reason="Ray is there")
-def test_where_ray_is_missing_one_sentence_says_what_to_install(tmp_path):
-    done = nics("--engine", "ray", "--out", tmp_path)
-    assert done.exit_code == 2
-    words = " ".join(done.output.split())
-    assert "engine 'ray' needs the module 'ray'" in words
-    assert "pip install 'nics_drl_bridge[sb3,train,distributed]'" in words
-
-
 @pytest.mark.process
 def test_an_interrupted_training_tells_the_command_that_resumes_it(tmp_path):
     imported = "from nics_drl_bridge.env.tasks.navigation import Navigation\n"
@@ -257,7 +237,11 @@ def test_an_interrupted_training_tells_the_command_that_resumes_it(tmp_path):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as process:
         checkpoint = tmp_path / "my run" / "seed_3" / "checkpoint.npz"
-        wait_for(lambda: checkpoint.is_file() or process.poll() is not None, 300.0)
+        until(
+            lambda: checkpoint.is_file() or process.poll() is not None,
+            "a checkpoint",
+            300.0,
+        )
         process.send_signal(signal.SIGINT)
         said = process.communicate(timeout=60.0)[1]
     assert process.returncode == 130, said
@@ -271,11 +255,3 @@ def test_an_interrupted_training_tells_the_command_that_resumes_it(tmp_path):
         "nics train --resume --out 'my run' --seeds 3 4 --episodes 7 --task own.py:Mine"
     )
     assert command == expected
-
-
-def wait_for(condition, timeout_s):
-    """Waits until a condition holds; fails after a deadline."""
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)

@@ -9,7 +9,6 @@ from nics_drl_bridge.recording.excite import (
     PERIOD_S,
     STILL_S,
     DrivePlan,
-    Exploration,
     Pattern,
     find_motion,
     predict,
@@ -110,30 +109,6 @@ def test_a_robot_that_moves_otherwise_than_expected_is_kept_within_too(
     robot = load_robot(name)
     really = robot.model_copy(update={"parameters": {**robot.parameters, **changes}})
     assert drive_another(robot, really, np.array(gain), seed=0) <= 2.0
-
-
-@pytest.mark.slow
-def test_without_being_watched_such_a_robot_would_leave(monkeypatch):
-    robot = load_robot("ackermann")
-    really = robot.model_copy(
-        update={"parameters": {**robot.parameters, "wheelbase": 0.24}}
-    )
-    monkeypatch.setattr(Exploration, "observe", lambda *_: None)
-    assert any(
-        drive_another(robot, really, np.array([1.1, 1.0]), seed) > 2.0
-        for seed in range(3)
-    )
-
-
-@pytest.mark.slow
-def test_what_is_seen_moves_the_expected_pose():
-    drive = DrivePlan(ROBOTS[1], duration=20.0).begin()
-    while not np.hypot(*drive.pose[:2]) > 0.1:
-        before = drive.pose
-        drive.choose_command()
-    step = geometry.between(before, drive.pose)
-    drive.observe(np.array([5.0, 0.0, 1.0]))
-    assert geometry.between([5.0, 0.0, 1.0], drive.pose) == pytest.approx(step)
 
 
 CAR = load_robot("ackermann")

@@ -9,7 +9,7 @@ from mmap import ACCESS_READ, mmap
 
 import lz4.frame
 import yaml
-from mcap.records import Chunk, DataEnd
+from mcap.records import DataEnd
 from mcap.writer import CompressionType, IndexType, Writer
 
 from nics_drl_bridge.errors import RecordingError
@@ -111,17 +111,6 @@ def packed_as_a_whole(folder, data):
     text = yaml.safe_dump({"rosbag2_bagfile_information": about})
     (folder / "metadata.yaml").write_text(text, encoding="utf-8")
     return folder
-
-
-def test_a_chunk_that_says_that_it_is_terabytes_is_refused(tmp_path):
-    path = written(tmp_path / "drive.mcap", **FORMS["bare"])
-    data = bytearray(path.read_bytes())
-    end, chunk = next(pair for pair in mapped(path) if isinstance(pair[1], Chunk))
-    place = end - len(chunk.data) - len(chunk.compression) - 24
-    assert struct.unpack_from("<Q", data, place)[0] == chunk.uncompressed_size
-    struct.pack_into("<Q", data, place, 2**42)
-    path.write_bytes(data)
-    refused(path, "not have its stated length")
 
 
 def find_data_end(path):

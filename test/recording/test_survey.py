@@ -73,14 +73,6 @@ def test_a_unit_of_the_pose_that_no_name_shows_is_in_doubt(tmp_path, columns):
     assert doubt.endswith("add `heading_unit: deg`")
 
 
-def test_columns_without_names_are_no_pose(tmp_path):
-    columns = drive(1500) | {"v": np.sin(np.arange(1500) * 0.05)}
-    _, drafted = draft(write(tmp_path / "log.csv", columns, header=False))
-    assert drafted["time"] == 0
-    assert drafted["pose"] == {"x": None, "y": None}
-    assert drafted["command"] is None
-
-
 def test_gaps_backward_stamps_repeated_and_missing_rows_are_listed(tmp_path, columns):
     order = np.concatenate([np.arange(50), [49, 49], np.arange(90, 200)])
     columns["t"][150:] -= 0.5
@@ -95,23 +87,6 @@ def test_gaps_backward_stamps_repeated_and_missing_rows_are_listed(tmp_path, col
         "stamps like the one before: 2, in rows that repeat all of it: 2",
     ):
         assert sentence in text
-
-
-def test_units_and_places_are_understood_from_names(tmp_path, columns):
-    named = {
-        "utm_easting": 4e5 + columns["x"],
-        "utm_northing": columns["y"],
-        "tracker_heading_deg": np.degrees(columns["yaw"]),
-        "cmd speed [km/h]": columns["w"] * 3.6,
-        "cmd_steer_angle": columns["w"],
-        "stamp": columns["t"],
-    }
-    path = write(tmp_path / "log.csv", named)
-    _, drafted = draft(path)
-    assert drafted["pose"]["heading_unit"] == "deg"
-    found = read_draft(path, drafted)
-    assert np.allclose(found.pose.values[:, 2], columns["yaw"])
-    assert np.allclose(found.command.values[:, 0], columns["w"])
 
 
 def test_a_source_without_a_readable_table_is_refused(tmp_path, columns):

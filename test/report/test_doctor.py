@@ -30,19 +30,10 @@ EXPECTED = Expected(load_robot("ackermann"), LIDAR, 0.1)
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
 
-def scan(t, **changed):
-    header = LIDAR.header._asdict() | {"time_increment": 0.0}
-    ranges = np.where(np.arange(LIDAR.beams) % 3, 0.6 * LIDAR.range_max, np.inf)
-    values = header | {"ranges": ranges, "frame": LIDAR.frame} | changed
-    frame = values.pop("frame")
-    ranges = np.asarray(values.pop("ranges"), np.float32)
-    return bags.new(
-        "sensor_msgs/msg/LaserScan",
-        bags.header(t, frame),
-        *values.values(),
-        ranges,
-        np.zeros(0, np.float32),
-    )
+def scan(t, frame=LIDAR.frame, **changed):
+    usual = np.where(np.arange(LIDAR.beams) % 3, 0.6 * LIDAR.range_max, np.inf)
+    ranges = changed.pop("ranges", usual)
+    return bags.scan_of(LIDAR, t, ranges, frame, **{"time_increment": 0.0} | changed)
 
 
 def odometry(t, frames=("odom", "base_link"), pose=1.0, speed=1.0, turn=1.0, **other):

@@ -5,7 +5,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.optimize import linprog
 from skid_rover import kinematics as skid_steer_kinematics
 from skid_rover import rover
 
@@ -15,15 +14,11 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.robot.braking import (
-    SLACK_M,
     Braking,
     Drift,
     TurnBraking,
-    _find_min_fraction,
-    _fit_tightest,
     derive_slowest_model,
     find_braking,
-    find_lowest_line,
     list_motions,
 )
 from nics_drl_bridge.robot.curve import InputCurve
@@ -341,37 +336,3 @@ def test_time_and_distance_are_those_of_even_braking_after_the_reaction():
     assert braking.time_s(straight) == pytest.approx(2.2)
     assert braking.time_s(mixed) == pytest.approx(1.4)  # of its slower part
     assert braking.mean_time_s(mixed) == pytest.approx(0.9)
-
-
-def test_no_share_of_a_bound_of_zero_is_taken():
-    bounded = _find_min_fraction(np.array([0.0, 0.3]), np.array([0.0, 0.5]))
-    assert bounded == pytest.approx(0.6)
-    assert _find_min_fraction(np.zeros(2), np.zeros(2)) == 1.0
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_the_lowest_line_above_points_is_that_of_a_linear_program(seed):
-    rng = np.random.default_rng(seed)
-    x = np.round(rng.uniform(0.0, 2.0, 30), 1)  # some twice
-    y = rng.uniform(0.0, 1.0) + rng.uniform(-0.5, 1.0) * x + rng.uniform(0.0, 0.3, 30)
-    at = rng.uniform(0.0, 2.0)
-    above = np.stack([-np.ones(30), -x], axis=1)
-    best = linprog([1.0, at], above, -y, bounds=(0.0, None))
-    intercept, slope = find_lowest_line(x, y, at)
-    assert min(intercept, slope) >= 0.0
-    assert (intercept + slope * x >= y - 1e-12).all()
-    assert intercept + slope * at == pytest.approx(best.fun, abs=1e-9)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_bound_on_stops_has_the_least_mean_excess(seed):
-    rng = np.random.default_rng(seed)
-    speed = rng.uniform(0.1, 2.0, 30)
-    pace = speed * rng.uniform(0.5, 1.5, 30)
-    distance = speed * (0.2 + 0.4 * pace) * rng.uniform(0.3, 1.0, 30)
-    fit = _fit_tightest(speed, pace, distance)
-    bound = np.stack([speed, speed * pace], axis=1)
-    weight = 1.0 / (distance + SLACK_M) / 30
-    best = linprog(weight @ bound, -bound, -distance, bounds=(0.0, None))
-    assert (fit.reaction_s, fit.inverse) == pytest.approx(tuple(best.x), abs=1e-7)
-    assert fit.slack == pytest.approx(best.fun - weight @ distance)

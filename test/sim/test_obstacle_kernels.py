@@ -18,7 +18,6 @@ from nics_drl_bridge.sim.world import (
     Motion,
     Patrol,
     Pedestrian,
-    plan_arrays,
 )
 
 WALKER = Pedestrian()
@@ -27,7 +26,6 @@ SQUARE = Patrol(
     waypoints=((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)), speed=0.7
 )
 MIXED = [STROLLER, SQUARE, WALKER, None, WALKER, STROLLER]
-WALLS = np.array([(-3.0, 0.5, -0.5, 0.5), (0.8, -1.0, 0.8, 3.0)])
 TOUCH = 1e-9
 
 
@@ -197,16 +195,6 @@ def test_a_wrong_motion_is_refused_by_its_key(text, key):
     with pytest.raises(ConfigError) as caught:
         validate({"motion": yaml.safe_load(text)}, Mover, "world.yaml")
     assert key in str(caught.value)
-
-
-def test_plans_hold_the_waypoints_of_all_patrols_one_after_the_other():
-    rows, waypoints = plan_arrays(
-        [None, SQUARE, WALKER, Patrol(waypoints=((0, 0), (1, 1)), speed=1)]
-    )
-    assert rows["kind"].tolist() == [at.STILL, at.PATROL, at.PEDESTRIAN, at.PATROL]
-    assert rows["first"][[1, 3]].tolist() == [0, 4]
-    assert np.array_equal(waypoints, [*SQUARE.waypoints, (0, 0), (1, 1)])
-    assert [part.shape for part in plan_arrays([])] == [(0,), (0, 2)]
 
 
 STRENGTH = 2.1

@@ -9,7 +9,6 @@ from robots import FOOTPRINT, RADIUS, direct_model, field, lidar, noisy_model
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.sim.randomisation import Randomisation
@@ -19,7 +18,6 @@ from nics_drl_bridge.sim.simulator import (
     FastSimulator,
     OutsideValidityWarning,
 )
-from nics_drl_bridge.sim.world import load_world
 
 ORIGIN = np.zeros((1, 1, 3))
 PERIOD = 0.1
@@ -79,21 +77,6 @@ def test_a_command_takes_effect_after_exactly_its_latency(latency):
         newest = np.floor((now - 0.01 - latency) / PERIOD + 1e-9)
         speed = commands[int(newest), 0, 0, 0] if newest >= 0 else 0.0
         assert data["twist"][0, 0, 0] == pytest.approx(speed)
-
-
-def test_robots_move_as_the_readable_model_does():
-    model = builtin_model("differential")
-    commands = random_commands(model, 20, 1, 1) * [0.3, 1.0]
-    history = drive(FastSimulator(model, load_world("empty")), [0], commands, ORIGIN)
-    pose = np.zeros(3)
-    state = np.zeros(len(model.robot.state))
-    for command, data in zip(commands, history, strict=True):
-        for _ in range(model.timing[1]):
-            pose, state = model.kinematics.step(pose, state, command[0, 0])
-        assert data["state"][0, 0] == pytest.approx(state, abs=1e-10)
-        assert geometry.between(pose, data["pose"][0, 0]) == pytest.approx(
-            np.zeros(3), abs=1e-10
-        )
 
 
 def test_robots_see_each_other_and_not_themselves():

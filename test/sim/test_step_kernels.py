@@ -13,7 +13,6 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim import simulator as sizes
-from nics_drl_bridge.sim.collision_kernels import body_cells
 from nics_drl_bridge.sim.simulator import STANDING, FastSimulator
 from nics_drl_bridge.sim.world import World
 
@@ -282,19 +281,3 @@ def test_a_crowd_in_cells_comes_to_the_bits_of_looking_at_all_bodies(monkeypatch
     monkeypatch.setattr(sizes, "CROWD", 0)
     assert sizes.Sizes(1, 12, 3, 0, 0).crowded
     assert digests(2, robots=12) == plain
-
-
-def test_obstacles_in_cells_are_seen_and_touched_like_those_that_are_all_looked_at(
-    monkeypatch,
-):
-    world = field(12.0, count=40)
-    made = []
-    monkeypatch.setattr(
-        sizes, "body_cells", lambda n, *rest: made.append(n) or body_cells(n, *rest)
-    )
-    in_cells = [digests(3, threads=threads, world=world) for threads in (1, 2)]
-    assert 3 in made
-    made.clear()
-    monkeypatch.setattr(sizes, "STANDING", 41)
-    assert in_cells == [digests(3, world=world)] * 2
-    assert 3 not in made

@@ -16,7 +16,7 @@ from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.sdf import Placed
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import FASTEST, Motion, require_inside
+from nics_drl_bridge.sim.world import FASTEST, Motion, check_inside
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 OBSTACLE = "obstacle_"  # prefix of the name of a world's obstacle, before its number
@@ -161,7 +161,7 @@ class Entities:
                 "zero twist."
             )
         if pose is not None:
-            require_inside(self.device.world, pose)
+            check_inside("the pose", self.device.world, pose[0], pose[1])
         if entity.robot >= 0:
             self._move_robot(entity.robot, pose, twist)
             return
@@ -206,7 +206,7 @@ class Entities:
 
         Raises OutsideError, and ConfigError for shapes that the simulator can't hold.
         """
-        require_inside(self.device.world, pose)
+        check_inside("the pose", self.device.world, pose[0], pose[1])
         used = {slot for entity in self.spawned.values() for slot in entity.slots}
         spare = list(self._spare)
         slots = list[int]()
@@ -234,7 +234,7 @@ class Entities:
 
     def spawn_robot(self, name: str, pose: Array) -> Entity:
         """Add a robot of the simulator's kind at a pose (3,). Raises OutsideError, ConfigError."""
-        require_inside(self.device.world, pose)
+        check_inside("the pose", self.device.world, pose[0], pose[1])
         count = len(self.robot_names)
         entity = Entity(name, robot=count, start=np.array(pose))
         self._remake(self._spare, list(range(count)), count + 1)

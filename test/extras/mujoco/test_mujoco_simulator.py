@@ -6,12 +6,9 @@ pytest.importorskip("mujoco", reason="needs MuJoCo: the extra `mujoco`")
 import mujoco
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.extras.mujoco.simulator import MujocoRobot, MujocoSimulator
-from nics_drl_bridge.extras.physics.simulator import record
+from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.lidar.exact_kernels import X, Y
-from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
@@ -137,11 +134,3 @@ def test_moving_obstacles_stand_in_mujoco_where_they_are_seen():
     assert np.hypot(*(now - began[0])[:, :2].T).max() > 0.2
     for k, mocap in simulator._mocap.items():
         assert simulator._data.mocap_pos[mocap, :2] == pytest.approx(now[k, [X, Y]])
-
-
-def test_a_model_is_identified_from_a_drive():
-    robot = MujocoRobot(load_robot("differential"))
-    drive = record(robot, np.random.default_rng(0), 20.0)
-    found = identify(drive, robot.spec)
-    assert found.held_out is not None
-    assert found.held_out.mean_position_error_m < 0.03 * found.held_out.mean_path_m
