@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,7 @@ LATE_S = 0.40
 FROZEN_S = 0.5
 WATCHED_S = 0.8  # after a fault's limit
 LOG_CHARACTERS = 500
+ROUNDING = 1e-9  # of a command that is read from a `cmd_vel`
 GATE = "command_gate"
 POLICY = "policy_node"
 MAX_IDLE = 3  # attempts in a row to inject a fault into a robot that moves
@@ -289,14 +291,12 @@ def judge_commands(
     return stopped_s, len(late_s)
 
 
-def find_reach(robot: RobotSpec, limits: Limits) -> tuple[Array, Array]:
-    """Return the minimum and the maximum `cmd_vel` (3,) within limits.
-
-    The turn rate of a car follows from both commands, so all of their extremes count, and zeros.
-    """
-    ends = zip(limits.low, np.zeros_like(limits.low), limits.high, strict=True)
-    twists = robot.to_cmd_vel(list(itertools.product(*ends)))
-    return twists.min(axis=0), twists.max(axis=0)
+def is_within(robot: RobotSpec, limits: Limits, twist: Array) -> bool:
+    """Return whether a `cmd_vel` (3,) keeps the limits of a robot's commands; NaN does not."""
+    command = robot.from_cmd_vel(twist)
+    inside = (command >= limits.low - ROUNDING) & (command <= limits.high + ROUNDING)
+    # a car's steering angle follows from its turn rate only as far as it can steer
+    return bool(inside.all()) and np.allclose(robot.to_cmd_vel(command), twist)
 
 
 class Surroundings(ExitStack):
@@ -311,7 +311,7 @@ class Surroundings(ExitStack):
         self._domain_id = choose_domain_id()
         model = open_model(setup.model)
         limits = load_limits(setup.limits, model.robot)
-        self._low, self._high = find_reach(model.robot, limits)
+        self._is_within = partial(is_within, model.robot, limits)
         twist = setup.twist
         if twist is None:
             command = 0.1 * np.where(limits.high > 0.0, limits.high, limits.low)
@@ -370,9 +370,8 @@ class Surroundings(ExitStack):
         stopped_s, unsafe = judge_commands(fault, robot.heard, good_s, broken_s)
         if self._setup.gated and self.processes[GATE].poll() is not None:
             stopped_s = math.inf  # a fault must not end the gate
-        for _, twist in robot.heard:
-            unsafe += not ((twist >= self._low) & (twist <= self._high)).all()
-        return Injected(stopped_s - good_s, stopped_s - broken_s, int(unsafe))
+        unsafe += sum(not self._is_within(twist) for _, twist in robot.heard)
+        return Injected(stopped_s - good_s, stopped_s - broken_s, unsafe)
 
     def give_up(self, error: Exception) -> None:
         """Tell why nothing was injected; end a policy, since a killed one may leave DDS amiss."""

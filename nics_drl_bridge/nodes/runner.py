@@ -80,7 +80,7 @@ def run_node(
         with open_node(make, context, sole_name) as node:
             for number in list_ending_signals():
                 signal.signal(number, lambda *_: stopping.set())
-            spin(node, stopping)
+            spin_node(node, stopping)
         return node
     except INPUT_ERRORS as error:
         sys.stderr.write(f"{explain(error)}\n")
@@ -106,9 +106,14 @@ def open_node(
         gc.collect()  # now, because later it may take 0.1 s while the robot moves
         for sentence in explain_ignored_values(node):  # rclpy ignores them silently
             node.get_logger().warning(sentence)
-        if getattr(node, "state", ACTIVE) == ACTIVE:
-            node.get_logger().info("running")
         yield node
+
+
+def spin_node(node: Node, stopping: threading.Event) -> None:
+    """Spin a node that was opened until an event, or until its context ends."""
+    if getattr(node, "state", ACTIVE) == ACTIVE:
+        node.get_logger().info("running")
+    spin(node, stopping)
 
 
 def _end(node: Any) -> None:

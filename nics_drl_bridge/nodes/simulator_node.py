@@ -1,6 +1,5 @@
 """simulator_node: the fast simulator, or another one, behind the topics of the hardware."""
 
-import itertools
 import math
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -386,10 +385,8 @@ class DeviceNode(qos.BridgeNode):
     def _open_topics(self) -> None:
         self.outbox = Outbox()
         self._clock_topic = self.create_publisher(Clock, CLOCK, qos.SENSOR_RELIABLE)
-        self._ports: list[RobotPort] = []
         self.map_topic = MapTopic(self)
-        for name in self._names:
-            self._ports.append(RobotPort(self, name))
+        self._ports = [RobotPort(self, name) for name in self._names]
         self._open_transforms()
         runner.serve(self, "~/reset", self._reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
@@ -406,8 +403,7 @@ class DeviceNode(qos.BridgeNode):
     def reopen_robots(self) -> None:
         """Open the topics of exactly the robots of the start."""
         self.remove_robots(range(len(self._ports)))
-        for name in self._names:
-            self._ports.append(RobotPort(self, name))
+        self._ports = [RobotPort(self, name) for name in self._names]
         self._publish_mounts()
 
     def remove_robots(self, gone: Sequence[int]) -> None:
@@ -427,10 +423,8 @@ class DeviceNode(qos.BridgeNode):
 
     def _publish_mounts(self) -> None:
         if self._transforms is not None:
-            mounts = itertools.chain.from_iterable(
-                port.mounts() for port in self._ports
-            )
-            self._fixed.publish(self._transforms(transforms=list(mounts)))
+            mounts = [mount for port in self._ports for mount in port.mounts()]
+            self._fixed.publish(self._transforms(transforms=mounts))
 
     def _start_time(self) -> None:
         step_ns = self.timing.step_ns

@@ -98,8 +98,9 @@ def measure(given: Given) -> Result:
 
 def set_bars(result: Result) -> Bars:
     bars = {name: bar for name, bar in BARS.items() if name in result}
-    failed = dict.fromkeys(result.get("failed", ()), Silence())
-    return bars | {"failed": failed}
+    if "failed" in result:
+        bars["failed"] = dict.fromkeys(result["failed"], Silence())
+    return bars
 
 
 OPTIONS = {

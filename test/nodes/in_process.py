@@ -17,7 +17,7 @@ from typing import Any
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.nodes import runner
-from nics_drl_bridge.nodes.listener import open_context, spin
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.qos import BridgeNode
 from nics_drl_bridge.nodes.record_node import RecordNode
 
@@ -107,7 +107,7 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
             make = node_class(self.node)
             context = open_context(arguments, domain_id)
             with runner.open_node(make, context, self.node) as made:
-                spin(made, self.stopping)
+                runner.spin_node(made, self.stopping)
             outcome = getattr(made, "outcome", None)  # of record_node
             self.returncode = 0
             if outcome is not None:

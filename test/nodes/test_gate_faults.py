@@ -25,9 +25,9 @@ from nics_drl_bridge.nodes.gate_faults import (
     FAULTS,
     Fault,
     Setup,
-    find_reach,
     inject_all,
     inject_trials,
+    is_within,
 )
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -61,14 +61,20 @@ def test_a_gate_stops_a_robot_whose_policy_dies_in_time_and_without_it_nothing_d
 
 
 @pytest.mark.parametrize("textbook", ["ackermann", "tricycle"])
-def test_what_a_car_may_be_told_by_turn_rate_is_within_reach(textbook):
+def test_a_car_may_be_told_by_turn_rate_what_its_limits_allow_and_no_more(textbook):
     car = load_robot(textbook).model_copy(update={"angular_is": "turn_rate"})
     limits = load_limits(textbook, car)
-    low, high = find_reach(car, limits)
     shares = np.random.default_rng(0).uniform(size=(100, 2))
-    told = car.to_cmd_vel(limits.low + shares * (limits.high - limits.low))
-    assert ((low <= told) & (told <= high)).all()
-    assert low[2] == -high[2] < 0.0
+    allowed = limits.low + np.vstack([shares, np.eye(2)]) * (limits.high - limits.low)
+    for command in allowed:
+        assert is_within(car, limits, car.to_cmd_vel(command))
+    for command in (
+        1.01 * limits.high,
+        np.array([limits.high[0], 1.01 * limits.low[1]]),
+    ):
+        assert not is_within(car, limits, car.to_cmd_vel(command))
+    for value in (np.nan, np.inf):
+        assert not is_within(car, limits, np.array([value, 0.0, 0.0]))
 
 
 class Process(AbstractContextManager):

@@ -11,7 +11,7 @@ from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes import runner
 from nics_drl_bridge.nodes.backends import DdsBackend
-from nics_drl_bridge.nodes.listener import open_context, spin
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.middleware_node import MiddlewareNode
 from nics_drl_bridge.nodes.parameters import Row
 from nics_drl_bridge.nodes.policy_node import PolicyNode
@@ -122,7 +122,7 @@ def test_a_node_whose_callback_raises_is_stopped_before_its_context_ends(domain_
         pytest.raises(BackendError, match="of the policy"),
         runner.open_node(Failing, context) as node,
     ):
-        spin(node, threading.Event())
+        runner.spin_node(node, threading.Event())
     assert stopped == [True]
     assert not context.ok()
 

@@ -84,14 +84,12 @@ class EntityServices:
     def _state_to_ros(self, entity: Entity) -> EntityState:
         """Return where an entity is and how it moves, in the frame of the map."""
         entities = self._simulation.entities
-        state = EntityState()
-        x, y, heading = entities.pose(entity).tolist()
-        state.header.frame_id = self._host.map_frame
-        state.header.stamp = conversions.stamp_to_ros(self._host.now_ns)
-        state.pose.position.x, state.pose.position.y = x, y
-        state.pose.orientation = conversions.heading_to_ros(heading)
-        state.twist = conversions.twist_to_ros(entities.twist(entity))
-        return state
+        host = self._host
+        stamped = conversions.pose_to_ros(
+            entities.pose(entity), host.now_ns, host.map_frame
+        )
+        twist = conversions.twist_to_ros(entities.twist(entity))
+        return EntityState(header=stamped.header, pose=stamped.pose, twist=twist)
 
     def set_state(self, request: Any, _: Any) -> None:
         """Answer SetEntityState."""
