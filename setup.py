@@ -182,7 +182,10 @@ setup(
         ],
         # For tools that list environments; gymnasium itself stopped reading this in 1.0.
         "gymnasium.envs": [f"NicsBridge = {PACKAGE}.env.registry:register_envs"],
-        f"{PACKAGE}.adapters": [f"foreign = {PACKAGE}.extras.foreign_policies"],
+        f"{PACKAGE}.adapters": [
+            f"foreign = {PACKAGE}.extras.foreign_policies",
+            f"torch = {PACKAGE}.extras.sb3.export",
+        ],
         f"{PACKAGE}.backends": [
             f"sim = {PACKAGE}.env.sim_backend:SimBackend",
             f"dds = {PACKAGE}.nodes.backends:dds_backend",
@@ -199,6 +202,7 @@ setup(
             f"mujoco_node = {PACKAGE}.extras.mujoco.node:main",
         ],
         f"{PACKAGE}.sensors": [f"lidar = {PACKAGE}.lidar.further_lidar:FurtherLidar"],
+        f"{PACKAGE}.trainings": [f"sb3 = {PACKAGE}.extras.sb3.training:Sb3Training"],
         f"{PACKAGE}.viewers": [f"human = {PACKAGE}.watch.human:HumanView"],
     },
 )

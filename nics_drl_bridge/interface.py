@@ -24,9 +24,9 @@ class RobotView:
     twist: Array  # (..., 3) estimate of vx [m/s], vy [m/s], wz [rad/s] in `base_link`
     # (..., B) [m], REP-117: `inf` no return, `-inf` too close
     ranges: NDArray[np.float32]
-    stamp_s: float
-    scan_age_s: float
-    odom_age_s: float
+    stamp_s: float = 0.0
+    scan_age_s: float = 0.0
+    odom_age_s: float = 0.0
     # name of an additional sensor -> reading (..., S), see `lidar.sensor`
     sensed: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     sensed_age_s: float = 0.0  # maximum age of these readings

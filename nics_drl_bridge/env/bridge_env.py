@@ -1,6 +1,7 @@
 """BridgeEnv: one task over one backend, as a Gymnasium environment."""
 
 from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -230,7 +231,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         free = np.full(shape, np.inf, np.float32)
         sensed = unread(self.model.sensors, 1, self.robots)
         starts = episodes.starts
-        view = RobotView(starts.copy(), 0.0 * starts, free, 0.0, 0.0, 0.0, sensed)
+        view = RobotView(starts.copy(), 0.0 * starts, free, sensed=sensed)
         memory = self.task.start_episodes(episodes)
         with suppress(ConfigError):  # the task may refuse the made-up view
             out = np.empty(self._shape, np.float32)
@@ -314,14 +315,10 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
 
     def _make_commands(self, action: AnyArray) -> Array:
         given = guard.check_action(action, self.action_space, "action")
-        made = self.task.drive(given.reshape(self._each), self.ended[None])
-        needed = (1, self.robots, len(self.model.robot.command))
-        if np.shape(made) != needed:
-            raise ConfigError(
-                f"commands are {np.shape(made)}; they must be {needed}: worlds, robots, "
-                "and a robot's commands."
-            )
-        return made
+        commands = self.task.drive(given.reshape(self._each), self.ended[None])
+        shape = (1, self.robots, len(self.model.robot.command))
+        checked: Array = self.task.check_result("drive", commands, shape)
+        return checked
 
     def halt(self) -> None:
         """Stops the robot until the next reset; any exception does so too."""
@@ -331,15 +328,12 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
     def _as_batch(self, view: RobotView) -> RobotView:
         lead = (1, self.robots, -1)
         sensed = {name: reading.reshape(lead) for name, reading in view.sensed.items()}
-        return RobotView(
-            view.pose.reshape(lead),
-            view.twist.reshape(lead),
-            view.ranges.reshape(lead),
-            view.stamp_s,
-            view.scan_age_s,
-            view.odom_age_s,
-            sensed,
-            view.sensed_age_s,
+        return replace(
+            view,
+            pose=view.pose.reshape(lead),
+            twist=view.twist.reshape(lead),
+            ranges=view.ranges.reshape(lead),
+            sensed=sensed,
         )
 
     def _drop_robot_axis(self, rows: AnyArray) -> AnyArray:
@@ -390,7 +384,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             ranges=view.ranges[0].copy(),
             bodies=facts.get("bodies", self.scene.bodies),
             goals=find_goals(self.memory),
-            member=int(np.asarray(self.scene.member)),
+            member=self.scene.member,
             step=self._steps,
             estimates=view.pose[0].copy(),
             covariance=None

@@ -39,11 +39,6 @@ class ClosedEnvError(ConfigError, gymnasium.error.ClosedEnvironmentError):
     """A method was called after `close`."""
 
 
-def _make_closed_error(method: Callable[..., Any]) -> ClosedEnvError:
-    call = f"{method.__name__}() after close()"
-    return ClosedEnvError(f"{call}: the env is closed; make a new one.")
-
-
 def refuse_after_close(
     method: Callable[Concatenate[Any, P], T],
 ) -> Callable[Concatenate[Any, P], T]:
@@ -52,7 +47,8 @@ def refuse_after_close(
     @wraps(method)
     def call_guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
         if self._closed:
-            raise _make_closed_error(method)
+            call = f"{method.__name__}() after close()"
+            raise ClosedEnvError(f"{call}: the env is closed; make a new one.")
         return method(self, *args, **kwargs)
 
     return call_guarded
@@ -61,20 +57,8 @@ def refuse_after_close(
 def guard_call(
     method: Callable[Concatenate[Any, P], T],
 ) -> Callable[Concatenate[Any, P], T]:
-    """Combines `refuse_after_close` and `stop_on_error` in one call, which saves time."""
-
-    @wraps(method)
-    def call_guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        if self._closed:
-            raise _make_closed_error(method)
-        try:
-            return method(self, *args, **kwargs)
-        except BaseException:
-            with delay_interrupts():
-                self.halt()
-            raise
-
-    return call_guarded
+    """Combines `refuse_after_close` and `stop_on_error`."""
+    return refuse_after_close(stop_on_error(method))
 
 
 @contextlib.contextmanager

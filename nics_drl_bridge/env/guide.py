@@ -60,7 +60,7 @@ class Guide:
 
     def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
         """Compute the path lengths in the scenes of episodes that begin in some worlds (n,)."""
-        member = np.asarray(scenes.member, np.int64)
+        member = scenes.member
         kernels.find_ways(
             self.fields, worlds, member, scenes.bodies, scenes.goals, self._grid
         )

@@ -20,11 +20,12 @@ from nics_drl_bridge.sim.state import MapField
 
 # clearance around the robot's circle above which a path is wide [m]
 COMFORT = 0.3
-TIGHT, SQUEEZED, BLOCKED = 2.0, 6.0, 12.0
-"""Cost of a metre where the circle just fits, where only the outline fits, and where neither fits;
-in between it is interpolated."""
-ROUNDS, SETTLED = 20, np.float32(1e-3)
-"""Maximum number of sweeps in all four directions, and the change that ends them earlier [m]."""
+# Cost of a metre; between these clearances it is interpolated.
+TIGHT = 2.0  # where the robot's circle just fits
+SQUEEZED = 6.0  # where only its outline fits
+BLOCKED = 12.0  # where neither fits
+ROUNDS = 20  # maximum number of sweeps in all four directions
+SETTLED = np.float32(1e-3)  # change that ends the sweeps earlier [m]
 
 
 class GuideGrid(NamedTuple):
@@ -103,18 +104,27 @@ def _lower_space(
     grid: GuideGrid,
 ) -> None:
     """Lower the clearance (rows, columns) of cells to the distance from a body [m]."""
+    rows, columns = space.shape
     cell = frame[2]
+    x = body[X] - frame[0]
+    y = body[Y] - frame[1]
     far = body[RADIUS] + grid.outer + COMFORT
-    first = max(int((body[Y] - far - frame[1]) / cell), 0)
-    last = min(int((body[Y] + far - frame[1]) / cell), len(space) - 1)
-    left = max(int((body[X] - far - frame[0]) / cell), 0)
-    right = min(int((body[X] + far - frame[0]) / cell), space.shape[1] - 1)
-    for i in range(first, last + 1):
-        dy = frame[1] + (i + 0.5) * cell - body[Y]
-        for j in range(left, right + 1):
-            dx = frame[0] + (j + 0.5) * cell - body[X]
-            gap = _measure_gap(dx, dy, body, grid.outlines)
-            space[i, j] = min(space[i, j], np.float32(gap))
+    first_row, end_row = _find_cells(y, far, cell, rows)
+    first_column, end_column = _find_cells(x, far, cell, columns)
+    for i in range(first_row, end_row):
+        dy = (i + 0.5) * cell - y
+        for j in range(first_column, end_column):
+            dx = (j + 0.5) * cell - x
+            gap = np.float32(_measure_gap(dx, dy, body, grid.outlines))
+            space[i, j] = min(space[i, j], gap)
+
+
+@kernel
+def _find_cells(middle: float, far: float, cell: float, count: int) -> tuple[int, int]:
+    """Return the first of `count` cells within `far` of `middle` [m], and the end of them."""
+    first = max(int((middle - far) / cell), 0)
+    end = min(int((middle + far) / cell) + 1, count)
+    return first, end
 
 
 @kernel
@@ -174,8 +184,12 @@ def update_ways(ways: Singles, prices: Singles, down: bool, left: bool) -> np.fl
         i = rows - 1 - a if down else a
         for b in range(columns):
             j = columns - 1 - b if left else b
-            beside = min(ways[i, max(j - 1, 0)], ways[i, min(j + 1, columns - 1)])
-            above = min(ways[max(i - 1, 0), j], ways[min(i + 1, rows - 1), j])
+            left_way = ways[i, max(j - 1, 0)]
+            right_way = ways[i, min(j + 1, columns - 1)]
+            lower_way = ways[max(i - 1, 0), j]
+            upper_way = ways[min(i + 1, rows - 1), j]
+            beside = min(left_way, right_way)
+            above = min(lower_way, upper_way)
             if not min(beside, above) < ways[i, j]:
                 continue
             way = _cross_cell(beside, above, prices[i, j])

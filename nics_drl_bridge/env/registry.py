@@ -137,13 +137,11 @@ def _import_task_class(name: Any) -> type:
 
 
 NAVIGATION = "NicsBridge/Navigation-v0"
-COOPERATIVE_REACHING = "NicsBridge/CooperativeReaching-v0"
-PURSUIT_EVASION = "NicsBridge/PursuitEvasion-v0"
 TASK = "NicsBridge/Task-v0"
 ENVIRONMENTS = {  # id -> arguments that define the environment
     NAVIGATION: {"task": "navigation"},
-    COOPERATIVE_REACHING: {"task": "cooperative_reaching"},
-    PURSUIT_EVASION: {"task": "pursuit_evasion"},
+    "NicsBridge/CooperativeReaching-v0": {"task": "cooperative_reaching"},
+    "NicsBridge/PursuitEvasion-v0": {"task": "pursuit_evasion"},
     TASK: {},
 }
 

@@ -17,8 +17,9 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.env.snapshot import Snapshot, locate_hits
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE
+from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS
 from nics_drl_bridge.lidar.maps import GridMap
+from nics_drl_bridge.lidar.shapes import find_outline
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.style import DARK, EDGE, GOAL, OTHER, SERIES, VERMILION
 
@@ -110,10 +111,11 @@ def draw_world(
     if place.grid is not None:
         _draw_map(axes, place.grid)
     if place.bounds is not None:
-        low, high = np.array(place.bounds).reshape(2, 2)
-        axes.add_patch(
-            Rectangle(tuple(low), *(high - low), fill=False, color=EDGE, ls="--")
+        x1, y1, x2, y2 = place.bounds
+        border = Rectangle(
+            (x1, y1), x2 - x1, y2 - y1, fill=False, color=EDGE, linestyle="--"
         )
+        axes.add_patch(border)
     for x1, y1, x2, y2 in place.all_walls():
         axes.plot([x1, x2], [y1, y2], color=WALL, linewidth=2)
     for body in bodies:
@@ -133,10 +135,9 @@ def _draw_map(axes: Axes, grid: GridMap) -> None:
 
 
 def _make_patch(world: AnyWorld, body: NDArray[np.float64]) -> Patch:
-    shape = world.shapes[int(body[SHAPE]) % len(world.shapes)]
-    if not len(shape.outline):
+    outline = find_outline(body, world.shapes)
+    if not len(outline):
         return Disc((body[0], body[1]), body[RADIUS], color=STANDING)
-    outline = shape.outline * (body[RADIUS] / shape.radius)
     corners = geometry.rotate(outline, body[HEADING]) + body[:2]
     return Outline(
         corners,

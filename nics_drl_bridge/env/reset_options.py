@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError, suggest
+from nics_drl_bridge.geometry import compute_depths, rotate
 from nics_drl_bridge.lidar.arrays import AnyArray
-from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN
-from nics_drl_bridge.lidar.shapes import Shape
+from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS
+from nics_drl_bridge.lidar.shapes import Shape, find_outline
 from nics_drl_bridge.seeds import GREATEST_SEED, check_seeds
-from nics_drl_bridge.sim.collision_kernels import Outline, outline_point
 from nics_drl_bridge.sim.scenes import Scene
 from nics_drl_bridge.sim.world import check_place
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -87,7 +87,7 @@ def check_places(
     """
     is_free_somewhere = not radius
     for scene, rows in zip(scenes, places, strict=True):
-        member = world.members[int(np.asarray(scene.member))]
+        member = world.members[scene.member]
         at = rows.reshape(-1, rows.shape[-1])
         for x, y in at[:, :2].tolist():
             check_place(f"reset option {option!r}", member, x, y, radius)
@@ -108,16 +108,11 @@ def _is_on(
     x: float, y: float, radius: float, body: AnyArray, shapes: Sequence[Shape]
 ) -> bool:
     """Returns True if a disc overlaps a body."""
-    dx, dy = (x, y) - body[:2]
-    c, s = body[[COS, SIN]]
-    reach = body[RADIUS]
-    if reach <= 0.0 or np.hypot(dx, dy) >= radius + reach:
+    apart = (x, y) - body[:2]
+    if body[RADIUS] <= 0.0 or np.hypot(*apart) >= radius + body[RADIUS]:
         return False
-    # Each shape may occur in several sizes.
-    shape = shapes[int(body[SHAPE]) % len(shapes)]
-    corners = shape.outline * (reach / shape.radius)
+    corners = find_outline(body, shapes)
     if not len(corners):
         return True
-    outline = Outline(corners, 0, len(corners))
-    gap = outline_point(c * dx + s * dy, c * dy - s * dx, outline)
-    return bool(gap < radius)
+    place = rotate(apart, -body[HEADING])
+    return bool(compute_depths(place[None], corners)[0] > -radius)

@@ -99,7 +99,7 @@ class SimBackend:
         if self._middlewares or self.simulator.readings:
             return None
         data = self.simulator.data
-        return RobotView(data.odom, data.twist, data.ranges, 0.0, 0.0, 0.0)
+        return RobotView(data.odom, data.twist, data.ranges)
 
     def facts(self) -> BackendFacts:
         """Returns true poses, obstacles and drawn values; see `interface.Backend`."""
@@ -139,7 +139,7 @@ class SimBackend:
             }
             scan = data.ranges[row].copy()
             motion = data.odom[row].copy(), data.twist[row].copy()
-            return RobotView(*motion, scan, now * 1e-9, 0.0, 0.0, sensed)
+            return RobotView(*motion, scan, now * 1e-9, sensed=sensed)
         views = []
         for m, middleware in enumerate(self._middlewares):
             pose = _decode_pose(data.odom[0, m])

@@ -199,18 +199,18 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
             raise gymnasium.error.ResetNeeded(
                 "reset all worlds before you reset some of them."
             )
-        # These worlds restart with a seed: their own, or the first world's plus their
-        # index.
-        if isinstance(seed, Sequence | np.ndarray):
-            if len(seed) != count:
-                raise ConfigError(
-                    f"{len(seed)} seeds for {count} worlds; give one each."
-                )
-            fresh = chosen & np.array([one is not None for one in seed])
-            seeds = np.array([one or 0 for one in seed], np.int64)
+        listed: Sequence[int | None]
+        if seed is None:
+            listed = [None] * count
+        elif isinstance(seed, Sequence | np.ndarray):
+            listed = seed
         else:
-            fresh = chosen & (seed is not None)
-            seeds = (seed or 0) + np.arange(count, dtype=np.int64)
+            listed = range(seed, seed + count)
+        if len(listed) != count:
+            raise ConfigError(f"{len(listed)} seeds for {count} worlds; give one each.")
+        # These worlds restart with a seed.
+        fresh = chosen & np.array([one is not None for one in listed])
+        seeds = np.array([one or 0 for one in listed], np.int64)
         # Seeds are drawn for worlds that never had one.
         new = chosen & (self._episode < 0) & ~fresh
         if new.any():
@@ -283,10 +283,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
             data.odom[rows],
             data.twist[rows],
             data.ranges[rows],
-            0.0,
-            0.0,
-            0.0,
-            {name: readings[name][rows] for name in readings},
+            sensed={name: readings[name][rows] for name in readings},
         )
 
     @guard.refuse_after_close
@@ -350,9 +347,6 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
             data.odom[part].copy(),
             data.twist[part].copy(),
             ranges.copy() if self.task.needs_last_scan else ranges,
-            0.0,
-            0.0,
-            0.0,
         )
         self.simulator.step_part(part, command)
         memory = {name: rows[part] for name, rows in self.memory.items()}

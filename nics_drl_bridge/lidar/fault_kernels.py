@@ -19,7 +19,6 @@ from nics_drl_bridge.lidar.arrays import Array, Integers, Singles
 NOISE_STD, NOISE_PROPORTIONAL, DROPOUT, DROPOUT_FAR, TOO_CLOSE, QUANTISATION, SKEW = (
     range(7)
 )
-PARAMETERS = 7
 AS_MINUS_INF, AS_RANGE_MIN, AS_NO_RETURN, AS_GHOST = range(4)  # values of TOO_CLOSE
 # values of SKEW
 CLOCKWISE = -1

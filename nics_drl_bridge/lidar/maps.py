@@ -76,13 +76,8 @@ class GridMap:
 
     def cell_to_world(self, cells: ArrayLike) -> Array:
         """Return the centres (..., 2) x, y [m] of cells (..., 2) row, column."""
-        x, y, heading = self.origin
-        place = (np.asarray(cells, np.float64) + 0.5) * self.resolution
-        c = np.cos(heading)
-        s = np.sin(heading)
-        across = place[..., 1]
-        up = place[..., 0]
-        return np.stack([x + c * across - s * up, y + s * across + c * up], axis=-1)
+        place = (np.asarray(cells, np.float64)[..., ::-1] + 0.5) * self.resolution
+        return np.asarray(rotate(place, self.origin[2]) + self.origin[:2])
 
     @cached_property
     def distance_field(self) -> Singles:

@@ -149,13 +149,11 @@ class Scanner:
         shape = (len(poses), self.spec.beams)
         if out is None:
             out = np.empty(shape, np.float32)
-        if out.shape != shape or out.dtype != np.float32:
+        is_float32 = out.dtype == np.float32 and out.flags.c_contiguous
+        if out.shape != shape or not is_float32:
             raise ConfigError(
-                f"out is {out.shape} {out.dtype}; it must be {shape} float32."
+                f"out is {out.shape} {out.dtype}; it must be {shape} float32, contiguous."
             )
-        if not out.flags.c_contiguous:
-            out[:] = self.scan(poses, bodies, walls)
-            return out
         worlds = np.arange(len(poses))
         scratch = scan_kernels.scan_scratch(self.spec.beams)
         member = np.zeros(len(poses), np.int64)

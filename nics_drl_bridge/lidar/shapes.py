@@ -168,6 +168,12 @@ def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
     return bodies
 
 
+def find_outline(body: Array, shapes: Sequence[Shape]) -> Array:
+    """Return the outline (V, 2) of a body in its own frame; each shape may have several sizes."""
+    shape = shapes[int(body[SHAPE]) % len(shapes)]
+    return np.asarray(shape.outline * (body[RADIUS] / shape.radius))
+
+
 def find_convex_hull(points: Array) -> Array:
     """Corners (P, 2) of the convex hull, counter-clockwise; Andrew's monotone chain (1979)."""
     ordered = sorted({(float(x), float(y)) for x, y in points})

@@ -87,6 +87,12 @@ class TopicCache:
             return math.inf
         return (now_ns - newest.stamp_ns) * S_PER_NS
 
+    def silence_s(self, topic: str, now_ns: int) -> float:
+        """Time since the latest arrival, by the receiver's clock [s]; inf if there was none."""
+        if topic not in self.arrivals:
+            return math.inf
+        return (now_ns - self.arrivals[topic][-1]) * S_PER_NS
+
     def rate_hz(self, topic: str, arrival_ns: int) -> float:
         """Rate of arrivals by the receiver's clock [Hz]; it falls while a datum is overdue."""
         arrivals = self.arrivals.get(topic, deque())
@@ -375,7 +381,7 @@ class Middleware:
             topic: TopicHealth(
                 received=received,
                 rate_hz=cache.rate_hz(topic, arrival_ns),
-                age_s=(arrival_ns - cache.arrivals[topic][-1]) * S_PER_NS,
+                age_s=cache.silence_s(topic, arrival_ns),
                 innovation=innovations.get(topic, math.nan),
             )
             for topic, received in cache.received.items()

@@ -15,20 +15,12 @@ from nics_drl_bridge.files import hash_bytes, write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.sectors import Reader, match_reader
-from nics_drl_bridge.lidar.spec import ScanHeader, from_device
-from nics_drl_bridge.middleware.ekf import ANYWHERE, START_STD
+from nics_drl_bridge.lidar.spec import ScanHeader
+from nics_drl_bridge.middleware.intake import Intake
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
-from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, open_bag
-from nics_drl_bridge.recording.imu_axis import GyroReader
-from nics_drl_bridge.recording.messages import (
-    get_stamp,
-    read_robot_command,
-    read_turn_variance,
-    read_twist,
-    read_whole_pose,
-)
+from nics_drl_bridge.recording.messages import get_stamp, read_robot_command
 
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
 TYPES: Mapping[str, tuple[str, ...]] = {
@@ -77,7 +69,8 @@ def estimate(
     rows = []
     middleware = playback.middleware
     for role, message in merge_messages(messages):
-        if playback.take(role, message) and role == ODOM:
+        used = playback.take(role, message.receive_ns, message.content)
+        if used and role == ODOM:
             stamp_ns = max(get_stamp(message.content), middleware.estimator.time_ns)
             view = middleware.view(stamp_ns)
             covariance = middleware.estimator.covariance
@@ -188,84 +181,40 @@ def _check_clocks(
             )
 
 
-class Playback:
-    """Feeds the middleware as the nodes do.
+class Playback(Intake):
+    """Feeds the middleware from a bag, as the nodes do.
 
-    With `has_pose`, a pose sensor determines the start. With `any_lidar`, the first scan determines
-    the `lidar`.
+    With `any_lidar`, the first scan determines the `lidar`.
     """
 
     def __init__(
         self, model: SimulatorModel, has_pose: bool, any_lidar: bool = False
     ) -> None:
-        self._model = model
-        self._start_std = ANYWHERE if has_pose else START_STD
-        self._any_lidar = any_lidar
-        self.middleware = Middleware(model)
+        super().__init__(model, has_pose)
+        self._takes[CMD_VEL] = self._take_command
         self.lidar = model.lidar
         self._reader: Reader | None = None
-        self._started = False
-        self._gyro = GyroReader()
+        if not any_lidar:
+            self._reader = Reader(model.lidar, backwards=False)
+        self._any_lidar = any_lidar
 
-    def take(self, role: str, message: Message) -> bool:
-        """Feeds a message; True if it was used and is the newest of its topic."""
-        takes = {
-            SCAN: self._take_scan,
-            ODOM: self._take_odometry,
-            CMD_VEL: self._take_command,
-            POSE: self._take_pose,
-            IMU: self._take_imu,
-        }
-        if not takes[role](message.receive_ns, message.content):
-            return False
-        newest = self.middleware.cache.newest.get(role)
-        return newest is not None and newest.stamp_ns == get_stamp(message.content)
-
-    def _take_scan(self, arrival_ns: int, message: Any) -> bool:
-        values = np.asarray(message.ranges, np.float32)
-        if self._any_lidar and self._reader is None:
-            header = ScanHeader(
-                *(float(getattr(message, name)) for name in ScanHeader._fields)
-            )
-            self._reader = match_reader(header, len(message.ranges), self._model.lidar)
+    def find_reader(self, scan: Any) -> Reader | None:
+        """Return the reader of the first scan; with `any_lidar`, None for other beams."""
+        beams = len(scan.ranges)
+        if self._reader is None:
+            values = (float(getattr(scan, name)) for name in ScanHeader._fields)
+            self._reader = match_reader(ScanHeader(*values), beams, self._model.lidar)
             self.lidar = self._reader.lidar
             self.middleware.expect_beams(self.lidar.beams)
-        if self._reader is not None:
-            values = self._reader.ordered(values)
-            if len(values) != self.lidar.beams:
-                return self.middleware.cache.reject(SCAN, "another lidar")
-        ranges = from_device(np.ascontiguousarray(values), self.lidar)
-        return self.middleware.scan(get_stamp(message), arrival_ns, ranges)
-
-    def _take_odometry(self, arrival_ns: int, message: Any) -> bool:
-        stamp_ns = get_stamp(message)
-        pose = np.array(read_whole_pose(message))
-        if not self._started and np.isfinite(pose).all():
-            self.middleware.reset(stamp_ns, pose, self._start_std)
-            self._started = True
-        twist = np.array(read_twist(message))
-        variance = read_turn_variance(message)
-        return self.middleware.odometry(stamp_ns, arrival_ns, pose, twist, variance)
+        if self._any_lidar and beams != self.lidar.beams:
+            return None
+        return self._reader
 
     def _take_command(self, _: int, message: Any) -> bool:
         command = read_robot_command(message, self._model.robot)
         stamp_ns = get_stamp(message) if hasattr(message, "header") else 0
         self.middleware.command(stamp_ns or None, command)
         return True
-
-    def _take_pose(self, arrival_ns: int, message: Any) -> bool:
-        covariance = getattr(message.pose, "covariance", None)
-        if covariance is not None:
-            covariance = np.reshape(covariance, (6, 6))[np.ix_([0, 1, 5], [0, 1, 5])]
-        return self.middleware.pose(
-            get_stamp(message), arrival_ns, read_whole_pose(message), covariance
-        )
-
-    def _take_imu(self, arrival_ns: int, message: Any) -> bool:
-        measured = self._gyro.read(message)
-        if measured is None:
-            return self.middleware.cache.reject(IMU, "no angular velocity")
-        return self.middleware.imu(get_stamp(message), arrival_ns, *measured)
 
 
 def merge_messages(

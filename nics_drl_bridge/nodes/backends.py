@@ -105,9 +105,9 @@ def dds_backend(
         namespaces = options.pop("namespaces", name_fleet(robots))
         if mode != LOCKSTEP or len(namespaces) != robots:
             needed = f"in mode 'lockstep' alone, with {robots} namespaces"
-            value = f"not in {mode!r} with {list(namespaces)!r}"
             raise ConfigError(
-                f"backend_options: a team of {robots} robots is driven {needed}, {value}."
+                f"backend_options: a team of {robots} robots is driven {needed}, not in "
+                f"{mode!r} with {list(namespaces)!r}."
             )
         refuse_unknown("backend 'dds'", options, option_names - {"namespace"})
         return FleetBackend(model, world, namespaces, **options)
@@ -193,7 +193,7 @@ class DdsBackend:
         self._subscriptions = {}
         for topic, kind in kinds.items():
             # Callbacks hold no reference to the backend, so that it can be garbage-collected.
-            put = partial(_put, self._inbox, topic)
+            put = partial(self._inbox.put, topic)
             self._subscriptions[topic] = self._link.node.create_subscription(
                 kind, topic, put, qos.SENSOR, raw=True
             )
@@ -239,8 +239,10 @@ class DdsBackend:
         """Check and publish a command (C,), the first half of a step."""
         self._link.check_open()
         if not self._can_send:
-            reason = "its data did not arrive, or no episode has begun; call reset()."
-            raise BackendError(f"the last step did not end: {reason}")
+            raise BackendError(
+                "the last step did not end: its data did not arrive, or no episode has begun; "
+                "call reset()."
+            )
         # If the simulator ran ahead, its data would be taken for the answer to this command.
         self._take_waiting()
         self._check_stamps()
@@ -310,7 +312,7 @@ class DdsBackend:
             if now_s > repeat_s:
                 self._episodes.repeat()
                 repeat_s = now_s + REPEAT_S
-            self._link.run_callback()
+            self._link.spin()
             self._take_waiting()
 
     def _take_waiting(self) -> None:
@@ -329,11 +331,10 @@ class DdsBackend:
             if not ahead_ns:
                 continue
             self._link.check_alone()
-            fix = (
-                "start the simulator with mode:=lockstep, and move it from here alone."
+            raise BackendError(
+                f"topic {topic!r}: stamped {ahead_ns / NS_PER_S:+.3f} s off the step; start "
+                "the simulator with mode:=lockstep, and move it from here alone."
             )
-            off = f"stamped {ahead_ns / NS_PER_S:+.3f} s off the step"
-            raise BackendError(f"topic {topic!r}: {off}; {fix}")
 
     def facts(self) -> BackendFacts:
         """Return the newest true pose, if `truth`, and with a randomisation how to draw scenes."""
@@ -346,10 +347,6 @@ class DdsBackend:
     def close(self) -> None:
         """Publish a zero command and end the node."""
         self._link.close()
-
-
-def _put(inbox: Inbox, topic: str, content: bytes) -> None:
-    inbox.put(topic, content)
 
 
 class FleetBackend:

@@ -40,7 +40,6 @@ from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, SCAN
 from nics_drl_bridge.nodes import (
     command_types,
-    device_parameters,
     gate_inputs,
     parameters,
     qos,
@@ -106,9 +105,9 @@ def _keep_clock(simulated: bool, parameters: list[Parameter]) -> SetParametersRe
     """Refuse a change of `use_sim_time`: the rules were derived for the clock at the start."""
     for parameter in parameters:
         if parameter.name == SIM_TIME and parameter.value != simulated:
-            fix = f"restart it with `-p {SIM_TIME}:={str(not simulated).lower()}`."
             reason = (
-                f"parameter {SIM_TIME!r} can't be changed while the gate runs; {fix}"
+                f"parameter {SIM_TIME!r} can't be changed while the gate runs; restart it with `-p "
+                f"{SIM_TIME}:={str(not simulated).lower()}`."
             )
             return SetParametersResult(successful=False, reason=reason)
     return SetParametersResult(successful=True)
@@ -155,8 +154,10 @@ class CommandGate(qos.BridgeNode):
             self._config, find_black_box(self), model.robot.name, logger
         )
         if not self._config.e_stop_required:
-            risk = "the robot moves even if e_stop was never received. That is for simulations"
-            logger.warning(f"e_stop_required is false: {risk}; set it on a vehicle.")
+            logger.warning(
+                "e_stop_required is false: the robot moves even if e_stop was never received. "
+                "That is for simulations; set it on a vehicle."
+            )
         if self._config.shield is not None:
             shield.warm_up()
         scan_motion.warm_up(self._config)
@@ -189,7 +190,7 @@ class CommandGate(qos.BridgeNode):
             ),
         )
         kinds = ("none", TWIST, TWIST_STAMPED)
-        raw = device_parameters.get_choice(self, FOREIGN, kinds)
+        raw = runner.get_choice(self, FOREIGN, kinds)
         raw_kind = command_types.name_of(stamped=raw != TWIST)
         command_types.TypeWatch(self, inputs.RAW, raw_kind, FOREIGN_SETTINGS)
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
@@ -213,7 +214,7 @@ class CommandGate(qos.BridgeNode):
             command_types.KINDS[raw_kind],
             inputs.RAW,
             partial(self._take_command, raw),
-            qos.EVERY_POLICY,
+            qos.EVERY_COMMAND,
             raw=True,
         )
         self._sources = Sources(self, commands.topic_name)

@@ -32,18 +32,6 @@ def expect_stamped(node: Node, topic: str) -> bool | None:
     return kinds == {TWIST_STAMPED} if len(kinds) == 1 else None
 
 
-def describe_deaf_subscribers(node: Node, topic: str, stamped: bool) -> str:
-    """Return a clause about subscribers that expect another type; empty if there are none."""
-    ends = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
-    kinds = sorted({end.topic_type for end in ends} - {name_of(stamped)})
-    if not kinds:
-        return ""
-    names = sorted(
-        {qos.find_owner(end) or "somebody" for end in ends if end.topic_type in kinds}
-    )
-    return f"{', '.join(names)} expects {' and '.join(kinds)} there, not {name_of(stamped)}"
-
-
 class TypeWatch:
     """Warns once about each node that publishes a type to which nobody here subscribes.
 

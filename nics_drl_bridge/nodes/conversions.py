@@ -25,11 +25,8 @@ from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, to_device
 from nics_drl_bridge.recording import messages
-from nics_drl_bridge.recording.topic_roles import TRANSFORMS
 from nics_drl_bridge.robot.spec import RobotSpec
 
-# x, y and heading in the 6 x 6 covariance of a message
-PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 INITIAL_POSE = "initialpose"  # topic, as RViz sends it
 # variance of z, roll and pitch, which a planar robot does not measure
 UNUSED_VARIANCE = 1e6
@@ -124,19 +121,8 @@ def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
 def covariance_to_ros(planar: Array) -> Array:
     """Return a covariance (3, 3) of x, y, heading, or of their rates, as a message's (36,)."""
     whole = np.diag(np.full(6, UNUSED_VARIANCE))
-    whole[PLANAR] = planar
+    whole[messages.PLANAR] = planar
     return whole.ravel()
-
-
-def pose_from_ros(
-    message: geometry.PoseStamped | geometry.PoseWithCovarianceStamped,
-) -> tuple[Array, Array | None]:
-    """Return the pose (3,) of a message and its covariance (3, 3), or None without one."""
-    has_covariance = isinstance(message, geometry.PoseWithCovarianceStamped)
-    covariance = (
-        np.reshape(message.pose.covariance, (6, 6))[PLANAR] if has_covariance else None
-    )
-    return np.array(messages.read_whole_pose(message)), covariance
 
 
 def read_initial_pose(
@@ -144,15 +130,13 @@ def read_initial_pose(
 ) -> Array:
     """Return the pose (3,) of `initialpose` in the map. Raises ConfigError if it can't be used."""
     frame = message.header.frame_id.strip("/")
-    pose = pose_from_ros(message)[0]
+    pose = np.array(messages.read_whole_pose(message))
     if frame not in ("", map_frame):
         fix = f"give it in {map_frame!r}, as RViz does if that is its fixed frame."
-        raise ConfigError(
-            f"{INITIAL_POSE}: a pose in the frame {frame!r} is refused; {fix}"
-        )
+        raise ConfigError(f"a pose in the frame {frame!r} is refused; {fix}")
     if not np.isfinite(pose).all():
         fix = "give finite numbers and a quaternion of unit length."
-        raise ConfigError(f"{INITIAL_POSE}: an invalid pose is refused; {fix}")
+        raise ConfigError(f"an invalid pose is refused; {fix}")
     return pose
 
 
@@ -188,9 +172,9 @@ def map_from_ros(message: OccupancyGrid) -> GridMap:
         or not cells.size
         or not info.resolution > 0.0
     ):
-        size = f"{info.height} x {info.width} of {info.resolution:g} m"
         raise ConfigError(
-            f"map: {cells.size} cells do not make {size}; check its publisher."
+            f"map: {cells.size} cells do not make {info.height} x {info.width} of "
+            f"{info.resolution:g} m; check its publisher."
         )
     place = info.origin.position
     turn = info.origin.orientation
@@ -252,18 +236,13 @@ def find_message_type(kind: str) -> Any | None:
         return None
 
 
-def transforms_type() -> Any | None:
-    """Return the class of the messages on `/tf`; None if its package is not installed."""
-    return find_message_type(TRANSFORMS)
-
-
 def find_sensor_type(sensor: Sensor) -> Any:
     """Return the class of a further sensor's message. Raises ConfigError if it is missing."""
     kind = find_message_type(sensor.message)
     if kind is None:
-        missing = f"the message {sensor.message} is not installed; install its package"
         raise ConfigError(
-            f"sensor {sensor.name!r}: {missing} with your ROS 2 distribution."
+            f"sensor {sensor.name!r}: the message {sensor.message} is not installed; install "
+            "its package with your ROS 2 distribution."
         )
     return kind
 

@@ -1,15 +1,13 @@
 """Parameters of a device node: devices, frames, episodes, and the rates of world and topics."""
 
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 
-from nics_drl_bridge.errors import ConfigError, suggest
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes.parameters import (
@@ -17,14 +15,11 @@ from nics_drl_bridge.nodes.parameters import (
     MODES,
     find_frame_fault,
     list_rows,
-    name_fleet,
 )
-from nics_drl_bridge.nodes.runner import declare_rows, get_number, get_text
+from nics_drl_bridge.nodes.runner import declare_rows, get_choice, get_number, get_text
 from nics_drl_bridge.pacing import find_common_step
 from nics_drl_bridge.robot.noise import Delay
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
-
-START = "episode_start"
 
 
 class DeviceTiming(NamedTuple):
@@ -63,8 +58,6 @@ def declare_device(node: Node, laser_frame: str) -> None:
         description=robots.about, read_only=True, dynamic_typing=True
     )
     node.declare_parameter(robots.name, robots.default, fleet)
-    # Added before the others are declared, so that it also checks the values at startup.
-    node.add_on_set_parameters_callback(partial(_check_episode, node))
     declare_rows(node, "device", "stamped", laser_frame=laser_frame)
     fault = find_frame_fault(node.get_parameters_by_prefix("").values())
     if fault:
@@ -132,16 +125,6 @@ def apply_timing(
     return replace(model, control_period=steps * dt)
 
 
-def get_choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
-    """Return a parameter that must be one of `valid`. Raises ConfigError with the nearest word."""
-    value = get_text(node, name)
-    if value not in valid:
-        raise ConfigError(
-            f"parameter {name!r}: unknown value {value!r}; {suggest(value, valid)}"
-        )
-    return value
-
-
 def get_frames(node: Node, namespace: str) -> Frames:
     """Return the frames of a robot; in a fleet all but the map begin with its namespace."""
     prefix = get_text(node, "frame_prefix") + (f"{namespace}/" if namespace else "")
@@ -150,23 +133,7 @@ def get_frames(node: Node, namespace: str) -> Frames:
     return Frames(world, odom, base, laser, footprint, prefix)
 
 
-def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResult:
-    reason = ""
-    needed = 3 * len(name_fleet(node.get_parameter("robots").value))
-    for parameter in parameters:
-        if parameter.name != START:
-            continue
-        values = np.array(parameter.value, dtype=np.float64)
-        if np.isnan(values).all():
-            continue
-        if not np.isfinite(values).all():
-            reason = f"{START} must be three finite numbers per robot: x, y, heading."
-        elif values.size != needed:
-            reason = f"{START} has {values.size} numbers; give {needed}, 3 per robot."
-    return SetParametersResult(successful=not reason, reason=reason)
-
-
 def get_episode_start(node: Node) -> Array | None:
     """Return x, y, heading of each robot (3 M,) for the next episode; None: by its seed."""
-    start = np.array(node.get_parameter(START).value, dtype=np.float64)
+    start = np.array(node.get_parameter("episode_start").value, dtype=np.float64)
     return None if np.isnan(start).all() else start

@@ -1,7 +1,6 @@
 """A robot's topics around a gate, intact or with faults, published over DDS."""
 
 import math
-import multiprocessing
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -17,8 +16,8 @@ from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.command_ear import hear, listen_to_commands
 from nics_drl_bridge.nodes.listener import SpunNode
+from nics_drl_bridge.recording.messages import read_command
 
 PERIOD_S = 0.1  # about the time between two scans
 PATIENCE_S = 60.0
@@ -32,11 +31,7 @@ class NoMotionError(BackendError):
 
 
 class Robot(SpunNode):
-    """A robot's topics, intact or with faults. It follows `cmd_vel` unless it is stuck.
-
-    Like a real base, a process of its own receives the commands. A process that publishes to a
-    killed one may be blocked by the middleware for a second, and would notice the stop late.
-    """
+    """A robot's topics, intact or with faults. It follows `cmd_vel` unless it is stuck."""
 
     quality = qos.COMMAND  # of what its sensors publish
 
@@ -48,7 +43,6 @@ class Robot(SpunNode):
         policy: bool = False,
         relayed: bool = False,
         odom_hz: float = 0.0,
-        has_base: bool = True,
     ) -> None:
         """Publish the robot's topics.
 
@@ -59,7 +53,6 @@ class Robot(SpunNode):
             policy: True if the policy of another node commands instead.
             relayed: True if commands bypass the gate.
             odom_hz: rate of odometry and estimate, a multiple of the lidar's; 0: the model's.
-            has_base: True if a process of its own receives the commands, see above.
         """
         super().__init__("robot", domain_id)
         kinds: dict[str, Any] = {
@@ -86,13 +79,7 @@ class Robot(SpunNode):
         self._relayed = relayed
         if relayed:
             self._past = self.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
-        spawning = multiprocessing.get_context("spawn")
-        self._ear, out = spawning.Pipe(duplex=False)
-        self._base = spawning.Process(target=hear, args=(domain_id, out), daemon=True)
-        if has_base:
-            self._base.start()
-        else:
-            listen_to_commands(self.node, out)
+        self.node.create_subscription(Twist, "cmd_vel", self._hear, qos.EVERY_COMMAND)
         self.node.create_subscription(
             TwistStamped, "cmd_vel_raw", self._hear_policy, qos.EVERY_COMMAND
         )
@@ -136,6 +123,14 @@ class Robot(SpunNode):
         self.jump_ns = 0  # of all stamps
         # commands that were written before are ignored, on the system clock
         self.since_ns = 0
+
+    def _hear(self, message: Twist, info: Mapping[str, Any]) -> None:
+        if info["source_timestamp"] < self.since_ns:
+            return
+        arrival_s = time.monotonic()
+        if "received_timestamp" in info:  # the message then waited for this call
+            arrival_s -= (time.time_ns() - info["received_timestamp"]) / NS_PER_S
+        self.heard.append((arrival_s, np.array(read_command(message))))
 
     def _hear_policy(self, message: TwistStamped, info: Mapping[str, Any]) -> None:
         if self._policy and not self.republished:
@@ -203,25 +198,9 @@ class Robot(SpunNode):
         """Press the emergency stop, by its topic."""
         self._topics["e_stop"].publish(Bool(data=True))
 
-    def until(self, done: Callable[[], object], seconds: float) -> bool:
-        """Keep publishing until a condition holds; return False if it does not in time."""
-
-        def is_done() -> object:
-            while self._ear.poll():
-                arrival_s, twist, written_ns = self._ear.recv()
-                if written_ns >= self.since_ns:
-                    self.heard.append((arrival_s, twist))
-            return done()
-
-        return super().until(is_done, seconds)
-
     def call(self, service: str, patience_s: float = PATIENCE_S) -> Trigger.Response:
         """Call a service of the gate. Raises TimeoutError without an answer in time."""
         return self.call_service(Trigger, f"command_gate/{service}", patience_s)
-
-    def listeners(self) -> int:
-        """Return the number of subscribers of its scans."""
-        return int(self._topics["scan"].get_subscription_count())
 
     @property
     def moves(self) -> bool:
@@ -264,10 +243,3 @@ class Robot(SpunNode):
         except TimeoutError:
             pass
         raise NoMotionError(f"the gate did not arm within {patience_s:g} s: {told}")
-
-    def close(self) -> None:
-        """Leave the graph."""
-        super().close()
-        if self._base.is_alive():
-            self._base.terminate()
-            self._base.join()

@@ -17,6 +17,7 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.message_packages import explain_install
 from nics_drl_bridge.nodes.runner import get_text
 from nics_drl_bridge.recording import messages
+from nics_drl_bridge.recording.topic_roles import TRANSFORMS
 
 if TYPE_CHECKING:
     from nics_drl_bridge.nodes.robot_topics import RobotTopics
@@ -49,10 +50,12 @@ def compute_odom_in_map(in_map: ArrayLike, in_odom: ArrayLike) -> Array:
 
 def find_transforms(node: Node, lacking: str) -> Any | None:
     """Return the class of the messages on `/tf`; None, with a warning of what is lacking then."""
-    kind = conversions.transforms_type()
+    kind = conversions.find_message_type(TRANSFORMS)
     if kind is None:
-        reason = f"the package tf2_msgs is not installed, so {lacking} not published"
-        node.get_logger().warning(f"{reason}; {explain_install('tf2_msgs')}.")
+        node.get_logger().warning(
+            f"the package tf2_msgs is not installed, so {lacking} not published; "
+            f"{explain_install('tf2_msgs')}."
+        )
     return kind
 
 
@@ -118,7 +121,7 @@ class GoalFrames:
         # frame -> its parent, and its pose in the parent
         self._mounted: dict[str, tuple[str, Array]] = {}
         self._odom: Array | None = None  # pose of `odom` in `map`, by a localiser
-        self._transforms = conversions.transforms_type()
+        self._transforms = conversions.find_message_type(TRANSFORMS)
         self._heard = []
         if self._transforms is not None:
             for topic, take, quality in (
@@ -164,8 +167,9 @@ class GoalFrames:
         """Return x, y (2,) of a goal in the map, given the robot's pose now. Raises ConfigError."""
         place = np.array([goal.pose.position.x, goal.pose.position.y, 0.0])
         if not np.isfinite(place).all():
-            position = f"({place[0]:g}, {place[1]:g})"
-            raise ConfigError(f"goal_pose: {position}: x and y must be finite numbers.")
+            raise ConfigError(
+                f"goal_pose: ({place[0]:g}, {place[1]:g}): x and y must be finite numbers."
+            )
         try:
             frame, place = self.fixed(goal.header.frame_id, place)
         except ConfigError as error:

@@ -11,8 +11,8 @@ from nics_drl_bridge.gate.state import replace
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.nodes import qos, wire
-from nics_drl_bridge.nodes.conversions import PLANAR, sensor_from_ros
-from nics_drl_bridge.recording.messages import is_rotation
+from nics_drl_bridge.nodes.conversions import sensor_from_ros
+from nics_drl_bridge.recording.messages import PLANAR, is_rotation
 
 TWIST = "Twist"
 TWIST_STAMPED = "TwistStamped"

@@ -95,8 +95,10 @@ class GateLog:
         """Count and log a decision that is not finite; that must never happen."""
         self.counters["not finite, sent as zero"] += 1
         if self._may_log("not finite"):
-            then = "zero is sent, and the e-stop is pressed"
-            self._logger.error(f"decided on {list(twist)}, which is not finite: {then}")
+            self._logger.error(
+                f"decided on {list(twist)}, which is not finite: zero is sent, and the e-stop "
+                "is pressed"
+            )
 
     def _may_log(self, kind: str) -> bool:
         """Return whether the last line of a kind is old enough; the next one counts as logged."""

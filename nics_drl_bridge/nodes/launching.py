@@ -1,7 +1,7 @@
 """Launch descriptions of the launches in `starting`, for the files in `launch/` and your own.
 
 Your own launch file can take a whole launch, as in `describe(LAUNCHES["vehicle"])`, or combine
-parts of `starting`, as in `describe(Launch("...", [simulator, bridge], {"use_sim_time": "true"}))`.
+parts, as in `describe(Launch("...", ["simulator", "bridge"], {"use_sim_time": "true"}))`.
 """
 
 from typing import Any

@@ -24,7 +24,7 @@ from geometry_msgs.msg import Twist, TwistStamped
 from numpy.typing import NDArray
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -37,21 +37,16 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Start
 from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import qos, wire
-from nics_drl_bridge.nodes.command_types import (
-    describe_deaf_subscribers,
-    expect_stamped,
-)
-from nics_drl_bridge.nodes.listener import ask, holds, open_context, spin
+from nics_drl_bridge.nodes.command_types import expect_stamped
+from nics_drl_bridge.nodes.listener import POLL_S, SpunNode, ask, spin
 from nics_drl_bridge.nodes.own_process import ENDING
 from nics_drl_bridge.nodes.parameters import is_stamped_default
-from nics_drl_bridge.nodes.runner import publish_last
+from nics_drl_bridge.nodes.runner import call_periodically, publish_last
 from nics_drl_bridge.nodes.wire import write_stamped_twist, write_twist
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-# Longest wait of the caller's thread for a callback, between two looks at its condition [s]. Always
-# the same, because rclpy drops callbacks that are ready when the timeout changes.
-POLL_S = 0.01
+LOOK_S = 0.05  # between two looks at a command's timeout [s]
 NO_RANDOMISATION = "none"
 # key of the stamp of an episode's first data in a simulator's diagnostics
 EPISODE_NS = "episode began [ns]"
@@ -59,7 +54,7 @@ EPISODE_NS = "episode began [ns]"
 LOST_S = 1.0
 
 
-class Link:
+class Link(SpunNode):
     """A node in its own context; its end or silence leaves a zero command behind."""
 
     def __init__(
@@ -72,35 +67,29 @@ class Link:
         command_timeout_s: float = math.inf,
         patience_s: float = 0.0,
     ) -> None:
-        namespace = parse_namespace(namespace)
         if threading.current_thread() is threading.main_thread():
             # Signals end Python like an exception, unless the program handles them itself.
             for number in ENDING:
                 if signal.getsignal(number) is signal.SIG_DFL:
                     signal.signal(number, lambda number, _: sys.exit(128 + number))
-        self._thread: threading.Thread | None = None  # of the executor, in real time
-        self._context = open_context(domain_id=domain_id)
+        overrides = [
+            Parameter(name, value=value) for name, value in (parameters or {}).items()
+        ]
+        super().__init__(
+            "bridge_env",
+            domain_id,
+            parse_namespace(namespace),
+            qos.BridgeNode,
+            parameter_overrides=overrides,
+        )
+        self._began_s = time.monotonic()
         self._undo = contextlib.ExitStack()
         self._undo.callback(self._context.try_shutdown)
+        self._undo.callback(self.node.destroy_node)
+        self._undo.callback(self._executor.shutdown, timeout_sec=1.0)
         # Also applies if the link never begins or its owner fails to construct.
         self._closing = weakref.finalize(self, _shut_down, self._undo)
         try:
-            overrides = [
-                Parameter(name, value=value)
-                for name, value in (parameters or {}).items()
-            ]
-            self.node = qos.BridgeNode(
-                "bridge_env",
-                namespace=namespace,
-                context=self._context,
-                start_parameter_services=False,
-                parameter_overrides=overrides,
-            )
-            self._undo.callback(self.node.destroy_node)
-            self._began_s = time.monotonic()
-            self._executor = SingleThreadedExecutor(context=self._context)
-            self._executor.add_node(self.node)
-            self._undo.callback(self._executor.shutdown, timeout_sec=1.0)
             if stamped is None:
                 stamped = self.expects_stamped(command_topic, patience_s)
             # frame of the robot, in which commands are given; unknown until it is set
@@ -114,23 +103,11 @@ class Link:
             self._timeout = CommandTimeout(
                 self._context, self.commands, self._kind, command_timeout_s
             )
-            INTERRUPTS.watch(self)
         except BaseException:
             self.close()
             raise
 
-    def wait_until(self, condition: Callable[[], Any], seconds: float) -> bool:
-        """Wait until a condition holds, while callbacks run; False if it does not in time."""
-        if self._thread is not None:
-            return holds(condition, seconds, POLL_S)
-        deadline = time.monotonic() + seconds
-        while not condition():
-            if time.monotonic() > deadline:
-                return False
-            self.run_callback()
-        return True
-
-    def run_callback(self) -> None:
+    def spin(self, timeout_s: float = POLL_S) -> None:
         """Wait for a moment for a callback, and run it; only without the link's own thread.
 
         Ctrl-C waits for its end, or it could leave the executor amid its bookkeeping, after which
@@ -138,19 +115,20 @@ class Link:
         """
         try:
             with delay_interrupts():
-                self._executor.spin_once(timeout_sec=POLL_S)
+                super().spin(timeout_s)
         except ExternalShutdownException:
             self.check_open()
 
     def expects_stamped(self, topic: str, patience_s: float) -> bool:
         """Wait for a subscriber of commands; True if it expects stamped ones, or by default."""
         name = self.node.resolve_topic_name(topic)
-        self.wait_until(lambda: self.node.count_subscribers(name) > 0, patience_s)
+        self.until(lambda: self.node.count_subscribers(name) > 0, patience_s)
         heard = expect_stamped(self.node, topic)
         return is_stamped_default() if heard is None else heard
 
     def begin(self) -> None:
         """Let a thread run the callbacks; call it once all subscriptions exist."""
+        call_periodically(self.node, LOOK_S, self._timeout.look)
         self._thread = threading.Thread(
             target=_spin,
             args=(self.node, self._timeout),
@@ -166,8 +144,10 @@ class Link:
         """Publish linear.x, linear.y, angular.z (3,); for NaN or inf, a zero and BackendError."""
         if not all(map(math.isfinite, twist)):
             self.halt()
-            fix = "finite, a zero was sent instead; look at what the task's `command` returns."
-            raise BackendError(f"command {twist} for {self._topic}: must be {fix}")
+            raise BackendError(
+                f"command {twist} for {self._topic}: must be finite, a zero was sent instead; "
+                "look at what the task's `command` returns."
+            )
         self._timeout.begin(moving=True)
         if self._kind is Twist:
             self.commands.publish(write_twist(twist))
@@ -179,11 +159,6 @@ class Link:
         if self._context.ok():
             self._timeout.begin(moving=False)
             self.commands.publish(self._kind())
-
-    def halt_if_moving(self) -> None:
-        """Publish a zero command unless the last one was zero."""
-        if self._timeout.moving:
-            self.halt()
 
     def check_open(self) -> None:
         """Raise BackendError if the link is closed."""
@@ -198,10 +173,12 @@ class Link:
         retry_period_s: float = math.inf,
     ) -> Any:
         """Call a service, and again at a period; return the first answer. Raises BackendError."""
-        answer = ask(client, request, timeout_s, self.wait_until, retry_period_s)
+        answer = ask(client, request, timeout_s, self.until, retry_period_s)
         if answer is None:
-            reason = f"no answer within {timeout_s:g} s; look at the simulator's log."
-            raise BackendError(f"service {client.srv_name}: {reason}")
+            raise BackendError(
+                f"service {client.srv_name}: no answer within {timeout_s:g} s; look at the "
+                "simulator's log."
+            )
         return answer
 
     def has_rivals(self) -> bool:
@@ -231,9 +208,8 @@ class Link:
     ) -> None:
         """Wait until all peers are matched. Raises BackendError naming what is missing."""
         node = self.node
-        commands = self.commands
         needed = dict[str, Callable[[], Any]]()
-        needed[f"subscriber of {self._topic}"] = commands.get_subscription_count
+        needed[f"subscriber of {self._topic}"] = self.commands.get_subscription_count
         for name in map(node.resolve_topic_name, topics):
             needed[f"publisher of {name}"] = partial(node.count_publishers, name)
         for client in clients:
@@ -241,22 +217,16 @@ class Link:
             needed[f"service {service}"] = client.service_is_ready
         deadline = self._began_s + patience_s
         left_s = deadline - time.monotonic()
-        if not self.wait_until(
-            lambda: all(there() for there in needed.values()), left_s
-        ):
+        if not self.until(lambda: all(there() for there in needed.values()), left_s):
             missing = ", no ".join(
                 name for name, there in needed.items() if not there()
             )
-            deaf = describe_deaf_subscribers(node, self._topic, self.stamped)
-            if deaf and not commands.get_subscription_count():
-                fix = f"set `stamped` to {not self.stamped}, or leave it out."
-                raise BackendError(f"topic {self._topic}: {deaf}; {fix}")
             raise BackendError(
                 f"after {patience_s:g} s there is still no {missing}; {advice}"
             )
         # A publisher that was killed stays in the graph for a while.
         left_s = deadline - time.monotonic()
-        self.wait_until(lambda: not self.has_rivals(), left_s)
+        self.until(lambda: not self.has_rivals(), left_s)
         self.check_alone()
         self._undo.callback(self._timeout.end)  # before that, nothing was commanded
         gc.collect()  # now, because later it may take 0.1 s while the robot moves
@@ -264,51 +234,11 @@ class Link:
     def close(self) -> None:
         """Publish a zero command and end the node."""
         self._closing()
-        INTERRUPTS.forget(self)
-
-
-class Interrupts:
-    """Halts all open links at Ctrl-C, even between two of their calls.
-
-    The interrupt is then passed on to the previous handler. Halting matters because the process may
-    live on, as in a notebook, and in lock-step no timeout would end the last command.
-    """
-
-    def __init__(self) -> None:
-        self._links: weakref.WeakSet[Link] = weakref.WeakSet()
-        self._before: Any = None
-
-    def watch(self, link: Link) -> None:
-        """Halt a link at Ctrl-C from now on, unless the process ignores or handles it itself."""
-        self._links.add(link)
-        handler = signal.getsignal(signal.SIGINT)
-        in_main = threading.current_thread() is threading.main_thread()
-        if in_main and callable(handler) and handler != self._interrupt:
-            self._before = handler
-            signal.signal(signal.SIGINT, self._interrupt)
-
-    def forget(self, link: Link) -> None:
-        """Stop watching a link that is closed."""
-        self._links.discard(link)
-        last = not self._links and signal.getsignal(signal.SIGINT) == self._interrupt
-        if last and threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, self._before)
-
-    def _interrupt(self, number: int, frame: Any) -> None:
-        try:
-            for link in list(self._links):
-                with contextlib.suppress(Exception):  # the others are halted, too
-                    link.halt_if_moving()
-        finally:
-            self._before(number, frame)
-
-
-INTERRUPTS = Interrupts()
 
 
 def _spin(node: Node, timeout: CommandTimeout) -> None:
     try:
-        spin(node, threading.Event(), timeout.look)
+        spin(node, threading.Event())
     finally:  # after an error too, since nothing would notice old data
         timeout.end()
         node.context.try_shutdown()
@@ -337,15 +267,13 @@ class CommandTimeout:
         self._kind = kind
         self._limit_s = limit_s
         self._due_s = self._answered_s = math.inf
-        self.moving = False  # the last command sent was not zero
 
     def begin(self, moving: bool) -> None:
         """Restart the timeout; call it before a command is published, zero or not."""
-        self.moving = moving
         self._due_s = time.monotonic() + self._limit_s if moving else math.inf
 
     def look(self) -> None:
-        """Publish one zero when the time is over; call it often, from another thread."""
+        """Publish one zero when the time is over; called often, in another thread."""
         due_s = self._due_s
         if due_s != self._answered_s and time.monotonic() >= due_s:
             self._answered_s = due_s
@@ -426,8 +354,10 @@ class EpisodeServices:
         facts = self._read_facts(timeout_s)
         for key, mine in self._identity.items():
             if facts.get(key) != mine:
-                runs = f"the simulator runs the {key} {facts.get(key)!r}, this env {mine!r}"
-                raise ModelError(f"{runs}; start both with the same {key}.")
+                raise ModelError(
+                    f"the simulator runs the {key} {facts.get(key)!r}, this env {mine!r}; "
+                    f"start both with the same {key}."
+                )
         result = self._link.call(self._parameters, request, timeout_s).result
         if not result.successful:
             raise BackendError(f"the simulator refused the episode: {result.reason}")
@@ -481,5 +411,6 @@ def read_message(topic: str, read: Callable[[bytes], T], content: bytes) -> T:
     try:
         return read(content)
     except wire.UNREADABLE as error:
-        reason = f"a message can't be read ({error}); check its publisher."
-        raise BackendError(f"topic {topic!r}: {reason}") from None
+        raise BackendError(
+            f"topic {topic!r}: a message can't be read ({error}); check its publisher."
+        ) from None

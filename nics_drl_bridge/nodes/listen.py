@@ -8,7 +8,7 @@ from rclpy.node import Node
 
 from nics_drl_bridge import defaults
 from nics_drl_bridge.nodes.conversions import find_message_type
-from nics_drl_bridge.nodes.listener import Listener
+from nics_drl_bridge.nodes.listener import SpunNode
 from nics_drl_bridge.nodes.qos import make_offer, make_profile
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.report.doctor_facts import (
@@ -34,21 +34,20 @@ def listen(
     imu: str = defaults.IMU_TOPIC,
 ) -> Facts:
     """Listen for a time [s] after the first message, awaited for at most 10 s; send nothing."""
-    node = Listener(NAME, domain_id)
-    node.start()
+    spun = SpunNode(NAME, domain_id)
     facts = Facts(f"the robot in {namespace or '/'}", True, names_in(namespace, imu))
     subscribed: set[str] = set()
     began = time.monotonic()
     end = None
     try:
         while time.monotonic() < (began + DISCOVERY_S if end is None else end):
-            _look(node, facts, subscribed, imu)
-            time.sleep(LOOK_S)
+            _look(spun.node, facts, subscribed, imu)
+            spun.until(lambda: False, LOOK_S)
             if end is None and facts.heard:
                 end = time.monotonic() + seconds
-        _look(node, facts, subscribed, imu)
+        _look(spun.node, facts, subscribed, imu)
     finally:
-        node.close()
+        spun.close()
     facts.end_ns = time.time_ns()
     return facts
 

@@ -1,4 +1,4 @@
-"""Contexts, and nodes that spin: in this thread, in one of their own, or as their owner asks.
+"""Contexts, and nodes that spin, in this thread or in one of their own.
 
 It imports no simulator, so that commands to a running robot start quickly.
 """
@@ -18,6 +18,9 @@ from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes.transport import GREATEST_DOMAIN_ID
 
 SPIN_S = 0.1
+# Longest wait for an event, between two looks at a condition [s]. Always the same, because rclpy
+# drops callbacks that are ready when the timeout changes.
+POLL_S = 0.01
 UNKNOWN = "UnknownROSArgsError"  # of rclpy, which exports it nowhere
 
 
@@ -40,9 +43,9 @@ def open_context(
         return context
     except RuntimeError as error:
         if type(error).__name__ == UNKNOWN:
-            fix = "as in `--ros-args -p NAME:=VALUE -r FROM:=TO --params-file FILE`"
             raise BackendError(
-                f"ROS 2 knows no argument {error}; write them {fix}."
+                f"ROS 2 knows no argument {error}; write them as in `--ros-args -p NAME:=VALUE "
+                "-r FROM:=TO --params-file FILE`."
             ) from None
         raise BackendError(
             f"ROS 2 does not start: {' '.join(str(error).split())}"
@@ -88,16 +91,13 @@ def ask(
     return None if answered is None else answered.result()
 
 
-def spin(
-    node: Node, stopping: threading.Event, look: Callable[[], None] = lambda: None
-) -> None:
-    """Spin a node until `stopping` is set or its context has been shut down; `look` often."""
+def spin(node: Node, stopping: threading.Event) -> None:
+    """Spin a node until `stopping` is set or its context has been shut down."""
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     try:
         while node.context.ok() and not stopping.is_set():
             executor.spin_once(timeout_sec=SPIN_S)
-            look()
     except Exception:  # another thread may have shut the context down meanwhile
         if node.context.ok():
             raise
@@ -105,71 +105,55 @@ def spin(
         executor.shutdown(timeout_sec=1.0)
 
 
-class Listener(Node):
-    """A node in a context of its own, which spins in a thread from `start` to `close`."""
+class SpunNode:
+    """A node in a context of its own, spun by its owner's waits, or from `start` on by a thread."""
 
     def __init__(
         self,
         name: str,
         domain_id: int | None = None,
         namespace: str = "",
-        has_parameters: bool = False,
+        make: Callable[..., Node] = Node,
+        **options: Any,
     ) -> None:
-        context = open_context([], domain_id)
-        self._thread = threading.Thread(
-            target=spin, args=(self, threading.Event()), daemon=True, name=name
-        )
+        self._context = open_context([], domain_id)
         try:
-            super().__init__(
+            self.node = make(
                 name,
-                context=context,
+                context=self._context,
                 namespace=namespace,
-                start_parameter_services=has_parameters,
+                start_parameter_services=False,
+                **options,
             )
         except BaseException:
-            context.try_shutdown()
+            self._context.try_shutdown()
             raise
-
-    def start(self) -> None:
-        """Start the thread; create all subscriptions first."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """End the thread, the node and its context."""
-        self.context.try_shutdown()
-        self._thread.join(timeout=2.0)
-        self.destroy_node()
-
-
-class SpunNode:
-    """A node with an executor and a context of its own."""
-
-    def __init__(
-        self, name: str, domain_id: int | None = None, namespace: str = ""
-    ) -> None:
-        self._context = open_context(domain_id=domain_id)
-        self.node = Node(
-            name,
-            context=self._context,
-            namespace=namespace,
-            start_parameter_services=False,
-        )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
+        self._thread: threading.Thread | None = None
         self._clients: dict[str, Any] = {}
 
-    def spin(self, timeout_s: float = 0.01) -> None:
-        """Handle one event, if one arrives in time."""
-        self._executor.spin_once(timeout_sec=timeout_s)
+    def start(self) -> None:
+        """Let a thread spin the node until `close`; create all subscriptions first."""
+        self._thread = threading.Thread(
+            target=spin, args=(self.node, threading.Event()), daemon=True
+        )
+        self._thread.start()
 
     def until(self, done: Callable[[], object], seconds: float) -> bool:
-        """Spin until a condition holds; return False if it does not in time."""
+        """Wait until a condition holds; return False if it does not in time."""
+        if self._thread is not None:
+            return holds(done, seconds, POLL_S)
         end = time.monotonic() + seconds
         while not done():
             if time.monotonic() > end:
                 return False
             self.spin()
         return True
+
+    def spin(self, timeout_s: float = POLL_S) -> None:
+        """Handle one event, if one arrives in time."""
+        self._executor.spin_once(timeout_sec=timeout_s)
 
     def call_service(
         self,
@@ -189,7 +173,10 @@ class SpunNode:
         return answer
 
     def close(self) -> None:
-        """End the node."""
+        """End the node, and its thread."""
+        if self._thread is not None:
+            self._context.try_shutdown()
+            self._thread.join(timeout=2.0)
         self._executor.shutdown(timeout_sec=1.0)
         self.node.destroy_node()
         self._context.try_shutdown()

@@ -186,17 +186,11 @@ def _run_nodes(
                 group.add(process.pid)
         os.sched_setaffinity(0, all_cores - {core} or all_cores)
         robot = Robot(
-            domain_id,
-            model,
-            np.zeros(3),
-            policy=True,
-            odom_hz=model.lidar.rate,
-            has_base=False,
+            domain_id, model, np.zeros(3), policy=True, odom_hz=model.lidar.rate
         )
         stack.callback(robot.close)
-        robot.silent.add(
-            "odometry/filtered"
-        )  # the middleware has an estimate of its own
+        # the middleware has an estimate of its own
+        robot.silent.add("odometry/filtered")
 
         def are_running() -> bool:
             for node in nodes:

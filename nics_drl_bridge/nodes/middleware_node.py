@@ -1,6 +1,5 @@
 """middleware_node: caches a robot's topics and publishes an estimate of its state."""
 
-from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -9,7 +8,7 @@ from nav_msgs.msg import Odometry
 from nics_drl_bridge.errors import LONGEST, shorten
 from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.middleware.measurement import Health, Rejection
+from nics_drl_bridge.middleware.measurement import Rejection
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.frames import MapToOdom, compute_odom_in_map
@@ -17,7 +16,6 @@ from nics_drl_bridge.nodes.parameters import BASE_FRAME, MAP_FRAME
 from nics_drl_bridge.nodes.robot_topics import SILENCE_S, RobotTopics
 from nics_drl_bridge.nodes.runner import (
     ACTIVE,
-    ERROR,
     OK,
     STALE,
     UNCONFIGURED,
@@ -30,7 +28,7 @@ class MiddlewareNode(ManagedNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("middleware_node", "middleware", **options)
-        self._rejected: dict[Rejection, int] = {}  # counts at the last look
+        self._rejected: set[Rejection] = set()  # at the last look
         runner.serve(self, "~/reset", self._reset)
         runner.diagnose(self, "topics", self._look)
 
@@ -87,61 +85,20 @@ class MiddlewareNode(ManagedNode):
         if self.state == UNCONFIGURED:
             return runner.Condition(self.state, OK, facts={})
         health = self._topics.middleware.health(self._topics.now_ns())
-        new = sorted(health.rejected.keys() - self._rejected.keys())
+        new = sorted(health.rejected.keys() - self._rejected)
+        self._rejected = set(health.rejected)
         if new:
             listed = shorten("; ".join(map(str, new)), LONGEST)
             self.get_logger().warning(
                 f"rejected data, counted in /diagnostics: {listed}"
             )
-        awaited = self._topics.expected
-        missing = ""
-        if self._topics.lacks_gyro:
-            missing = "nobody publishes one, though the model was made with it: the wheels turn"
-            self.get_logger().warning(f"imu: {missing}", once=True)
-        else:
-            awaited = tuple(dict.fromkeys((*awaited, *self._topics.optional)))
-        level, trouble = judge_topics(health, awaited, self._rejected)
-        self._rejected = health.rejected
-        message = trouble or ("receiving" if self.state == ACTIVE else self.state)
-        shown = health.describe() | ({"imu": missing} if missing else {})
-        return runner.Condition(message, level, shown, self._hardware)
-
-
-def judge_topics(
-    health: Health, expected: Sequence[str], before: Mapping[Rejection, int]
-) -> tuple[bytes, str]:
-    """Return the level of a diagnosis, and a sentence about expected topics without usable data.
-
-    Silent topics are stale, and those whose data are refused an error. The sentence is empty if
-    there are none. `before` holds earlier counts of `health.rejected`: a topic whose count grew is
-    not silent.
-    """
-    unusable = [topic for topic in expected if topic not in health.topics]
-    since = "yet"
-    if not unusable:
-        since = f"for {SILENCE_S:g} s"
-        unusable = [
-            topic for topic in expected if health.topics[topic].age_s > SILENCE_S
-        ]
-    silent = []
-    refused = []
-    for topic in unusable:
-        count = 0
-        reason = ""  # the last one whose count grew
-        for rejection, number in health.rejected.items():
-            if rejection.topic == topic:
-                count += number
-                if number > before.get(rejection, 0):
-                    reason = rejection.reason
-        if reason:
-            refused.append(f"{topic}: {count} refused, the last: {reason}")
-        else:
-            silent.append(topic)
-    clauses = [f"nothing on {', '.join(silent)} {since}"] if silent else []
-    level = OK
-    if unusable:
-        level = ERROR if refused else STALE
-    return level, "; ".join([*clauses, *refused])
+        awaited = dict.fromkeys((*self._topics.expected, *health.topics))
+        silent = self._topics.list_silent(awaited, SILENCE_S)
+        level = STALE if silent else OK
+        message = "receiving" if self.state == ACTIVE else self.state
+        if silent:
+            message = f"nothing usable on {', '.join(silent)}"
+        return runner.Condition(message, level, health.describe(), self._hardware)
 
 
 main = partial(runner.run_node, MiddlewareNode, sole_name="middleware_node")

@@ -26,7 +26,7 @@ from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.listener import Listener, ask, holds
+from nics_drl_bridge.nodes.listener import SpunNode, holds
 from nics_drl_bridge.recording.messages import read_whole_pose
 
 GATE = "command_gate"
@@ -141,9 +141,10 @@ class Operator:
     def __init__(self, domain_id: int | None = None) -> None:
         # policy node -> its condition, and the values of its diagnostics; written by the thread
         self._policies: dict[str, tuple[str, dict[str, str]]] = {}
-        self._node = Listener("nics_operator", domain_id)
+        self._spun = SpunNode("nics_operator", domain_id)
+        self._node = self._spun.node
         self._subscribe()
-        self._node.start()
+        self._spun.start()
 
     def _subscribe(self) -> None:
         self._node.create_subscription(
@@ -264,20 +265,21 @@ class Operator:
     def _gates(self) -> set[str]:
         """Return the names of all gates that are seen."""
         services = self._node.get_service_names_and_types()
-        ends = [
+        return {
             name.removesuffix("/arm")
             for name, _ in services
             if name.endswith(f"/{GATE}/arm")
-        ]
-        return set(ends)
+        }
 
     def _explain_absence(
         self, what: str, seconds: float, space: str, others: Sequence[str]
     ) -> str:
         """Return a sentence that says where nobody is, and which others there are."""
         domain = self._node.context.get_domain_id()
-        where = f"in namespace {space or '/'} of ROS domain {domain}"
-        fault = f"no {what} was seen {where} within {seconds:g} s"
+        fault = (
+            f"no {what} was seen in namespace {space or '/'} of ROS domain {domain} within "
+            f"{seconds:g} s"
+        )
         if not others:
             return f"{fault}; start one, as by `nics up simulation`, in the same ROS_DOMAIN_ID."
         first = get_namespace_of(others[0]).strip("/")
@@ -297,7 +299,7 @@ class Operator:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._node.close()
+        self._spun.close()
 
 
 class Witness(Operator):
@@ -332,11 +334,11 @@ class Witness(Operator):
 
     def touched(self, simulator: str, timeout_s: float) -> bool:
         """True if the simulated robot touched something in this episode. Raises BackendError."""
-        client = self._node.create_client(SelfTest, f"{simulator}/self_test")
-        wait = partial(holds, poll_s=POLL_S)
-        response = ask(client, SelfTest.Request(), timeout_s, wait, REPLY_S)
-        self._node.destroy_client(client)
-        if response is None:
-            reason = f"{simulator} did not answer within {timeout_s:g} s"
-            raise BackendError(f"the episode can't be judged: {reason}.")
+        service = f"{simulator}/self_test"
+        try:
+            response = self._spun.call_service(
+                SelfTest, service, timeout_s, retry_period_s=REPLY_S
+            )
+        except TimeoutError as error:
+            raise BackendError(f"the episode can't be judged: {error}.") from None
         return not any(response.passed)

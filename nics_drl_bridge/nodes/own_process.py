@@ -6,7 +6,7 @@ whose content `tee` forwards to the output and to the log file; what does not fi
 terminal itself must not be made non-blocking, because that would affect every process that uses it.
 
 Python runs signal handlers between two of its own instructions, so none runs while LLVM compiles
-for seconds. Until a node runs, it has nothing to clean up, and signals keep their default effect:
+for seconds. Until a node spins, it has nothing to clean up, and signals keep their default effect:
 they end the process, with the signal's exit code. At the end, Python is not finalised either: on a
 busy machine that takes as long as everything before, and unloads libraries while their threads run.
 """
@@ -223,7 +223,6 @@ ENDING = (
 )
 """Signals that end a process unless it handles them, except SIGKILL, signals of a fault in the
 process itself, and those that Python ignores, such as SIGPIPE."""
-_own_process = False  # True if this process is a single node
 
 
 def leave(code: int) -> NoReturn:
@@ -242,28 +241,6 @@ def list_ending_signals() -> list[int]:
     """
     outlives = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return [number for number in ENDING if not (outlives and number == signal.SIGHUP)]
-
-
-def begin_own_process() -> None:
-    """Let `end_at_once` take effect, because this process is a single node."""
-    global _own_process
-    _own_process = True
-
-
-@contextlib.contextmanager
-def end_at_once() -> Iterator[None]:
-    """Within this context, let ending signals end the process at once, whatever it is doing."""
-    if not _own_process:
-        yield
-        return
-    handlers = {number: signal.getsignal(number) for number in list_ending_signals()}
-    for number in handlers:
-        signal.signal(number, signal.SIG_DFL)
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
 
 
 def take_priority(priority: int) -> str:

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 from nics_drl_bridge import defaults
 from nics_drl_bridge.config import parse_yaml, read_text
 from nics_drl_bridge.errors import ConfigError, shorten
-from nics_drl_bridge.nodes.path_checks import GoalCheck, ProgressCheck
 from nics_drl_bridge.nodes.transport import is_before_kilted
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
@@ -24,7 +23,6 @@ REALTIME = "realtime"
 LOCKSTEP = "lockstep"
 MODES = (REALTIME, LOCKSTEP, "as_fast_as_possible")
 NO_POSE = defaults.POSE_TYPE
-POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped")
 STAMPED = "enable_stamped_cmd_vel"
 IMU = "imu"
 BASE_FRAME = "base_frame"
@@ -97,8 +95,10 @@ def find_frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
         if not FRAME.fullmatch(frame) and (
             frame or name not in (*MAY_BE_EMPTY, *may_be_empty)
         ):
-            needed = "must be 1 to 255 characters, without blanks or a leading /"
-            return f"parameter {name!r}: {needed}, not {shorten(frame, 80)!r}."
+            return (
+                f"parameter {name!r}: must be 1 to 255 characters, without blanks or a leading /, "
+                f"not {shorten(frame, 80)!r}."
+            )
     base = frames.get(BASE_FRAME, "")
     for name in (MAP_FRAME, "odom_frame"):
         if base and frames.get(name, "") == base:
@@ -106,18 +106,13 @@ def find_frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
     return ""
 
 
-def list_checker_rows(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
-    """Return the parameters of the named checks; they are those of Nav2's checkers."""
-    rows = []
-    for names, check in ((goals, GoalCheck), (progress, ProgressCheck)):
-        known: dict[str, Any] = {each.name: each.default for each in fields(check)}
-        known["plugin"] = f"nav2_controller::Simple{check.__name__}er"
-        if check is ProgressCheck:
-            known["required_movement_angle"] = 0.5
-        checks = [row for row in list_rows("checkers", **known) if row.name in known]
-        for name in names:
-            rows += [row._replace(name=f"{name}.{row.name}") for row in checks]
-    return rows
+def list_checker_rows(group: str, names: Sequence[str]) -> list[Row]:
+    """Return the parameters of Nav2's goal or progress checkers (the group) of some names."""
+    return [
+        row._replace(name=f"{name}.{row.name}")
+        for name in names
+        for row in list_rows(group)
+    ]
 
 
 def name_fleet(robots: Any) -> tuple[str, ...]:
@@ -131,8 +126,10 @@ def name_fleet(robots: Any) -> tuple[str, ...]:
     names = tuple(robots) if is_list else ()
     valid = all(isinstance(name, str) and NAMESPACE.fullmatch(name) for name in names)
     if not valid or not len(names) == len(set(names)) in range(1, GREATEST_FLEET + 1):
-        fix = f"give a count from 1 to {GREATEST_FLEET}, or a list of different namespaces"
-        raise ConfigError(f"'robots' is {robots!r}; {fix}, as in [robot1, robot2].")
+        raise ConfigError(
+            f"'robots' is {robots!r}; give a count from 1 to {GREATEST_FLEET}, or a list of "
+            "different namespaces, as in [robot1, robot2]."
+        )
     return names
 
 
@@ -190,5 +187,6 @@ def describe_node(name: str) -> NodeFacts:
     if name == "record_node":
         rows = list_drive_rows()
     if name == "policy_node":
-        rows += list_checker_rows(["general_goal_checker"], ["progress_checker"])
+        rows += list_checker_rows("goal_checker", ["general_goal_checker"])
+        rows += list_checker_rows("progress_checker", ["progress_checker"])
     return NodeFacts(parameters=rows, **facts)

@@ -2,7 +2,6 @@
 
 import math
 import time
-import traceback
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped
 
-from nics_drl_bridge.errors import BridgeError, ConfigError, shorten
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, RobotView
@@ -29,7 +28,6 @@ from nics_drl_bridge.policy.policies import open_policy
 
 # time between two looks at cancelled goals and silent data, as a fraction of the control period
 POLLS = 0.5
-LONGEST_REASON = 300  # maximum length of a policy's error text [characters]
 
 
 class PolicyNode(ManagedNode):
@@ -52,8 +50,10 @@ class PolicyNode(ManagedNode):
         self._open_policy(model)
         goal = self._goal = np.array(self.get_parameter("goal").value, np.float64)
         if len(goal) != 2 or not (abs(goal).max() <= 1e8 or np.isnan(goal).all()):
-            needed = "must be [x, y] within 1e8 m, or both NaN to wait for goal_pose"
-            raise ConfigError(f"parameter 'goal': {needed}, not {goal.tolist()}.")
+            raise ConfigError(
+                "parameter 'goal': must be [x, y] within 1e8 m, or both NaN to wait for "
+                f"goal_pose, not {goal.tolist()}."
+            )
         self._read_pace(model.control_period)
         self._acted_ns = 0
         self._answer = None
@@ -90,8 +90,10 @@ class PolicyNode(ManagedNode):
         names = ("rate", "deadline", "late_limit")
         rate, limit_s, patience = (self.get_parameter(name).value for name in names)
         if rate < 0.0 or limit_s <= 0.0:
-            values = f"parameters rate {rate}, deadline {limit_s}"
-            raise ConfigError(f"{values}: must be at least 0, and more than 0.")
+            raise ConfigError(
+                f"parameters rate {rate}, deadline {limit_s}: must be at least 0, and more "
+                "than 0."
+            )
         if np.isnan(limit_s):
             limit_s = 0.5 * period_s
         self._deadline = Deadline(limit_s, patience)
@@ -128,8 +130,9 @@ class PolicyNode(ManagedNode):
         self._open_policy(replace(self._model, lidar=lidar))
         begin, end = np.degrees([lidar.angles[0], lidar.angles[-1]])
         done = "used" if self._task.scan is None else "resampled"
-        span = f"from {begin:.4g} to {end:.4g} deg"
-        self.get_logger().info(f"scans of {lidar.beams} beams {span} are {done}")
+        self.get_logger().info(
+            f"scans of {lidar.beams} beams from {begin:.4g} to {end:.4g} deg are {done}"
+        )
 
     def _on_goal(self, message: PoseStamped) -> None:
         stamp_ns = conversions.stamp_from_ros(message.header.stamp)
@@ -244,21 +247,8 @@ class PolicyNode(ManagedNode):
         )
 
     def _asked(self, view: RobotView, goal: Array) -> Array:
-        try:
-            action = self._policy.act(self._task.observation(view, {"goal": goal}))
-            return self._task.robot.to_cmd_vel(self._task.command(action))
-        except BridgeError:
-            raise
-        except Exception as error:
-            self.get_logger().debug(traceback.format_exc())
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            words = shorten(f"{type(error).__name__}: {error}", LONGEST_REASON)
-            name = self.get_parameter("policy").value
-            where = f"{place.filename}, line {place.lineno}"
-            fix = "the robot is stopped; fix the policy."
-            raise BridgeError(
-                f"policy {name!r} raised {words} ({where}); {fix}"
-            ) from error
+        action = self._policy.act(self._task.observation(view, {"goal": goal}))
+        return self._task.robot.to_cmd_vel(self._task.command(action))
 
     def _message(self, twist: Array, stamp_ns: int) -> TwistStamped:
         frame = runner.get_text(self, "base_frame")

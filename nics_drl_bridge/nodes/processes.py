@@ -27,9 +27,9 @@ def choose_domain_id() -> int:
     if not variable:
         return unused_domain_id()
     if not variable.isdecimal() or int(variable) > GREATEST_DOMAIN_ID:
-        fix = f"it must be a number from 0 to {GREATEST_DOMAIN_ID}, or unset."
         raise ConfigError(
-            f"the environment variable ROS_DOMAIN_ID is {variable!r}; {fix}"
+            f"the environment variable ROS_DOMAIN_ID is {variable!r}; it must be a number from "
+            f"0 to {GREATEST_DOMAIN_ID}, or unset."
         )
     return int(variable)
 
@@ -50,9 +50,12 @@ def make_module_command(module: str) -> list[str]:
     `python -m` looks for modules in the working folder first. That folder may hold arbitrary data,
     such as a model with a file `json.py`. PYTHONSAFEPATH prevents this only since Python 3.11.
     """
-    path = f"import sys; sys.path[:] = {sys.path!r}"
-    run = f"from runpy import run_module; run_module({module!r}, run_name='__main__')"
-    return [sys.executable, "-c", f"{path}; {run}"]
+    return [
+        sys.executable,
+        "-c",
+        f"import sys; sys.path[:] = {sys.path!r}; from runpy import run_module; "
+        f"run_module({module!r}, run_name='__main__')",
+    ]
 
 
 def prepare_child() -> Callable[[], None]:
@@ -104,9 +107,9 @@ def find_program(node: NodeStart) -> list[str]:
         return [*make_module_command(f"{PACKAGE}.nodes.start"), node.executable]
     prefix = find_prefix(node.package)
     if prefix is None:
-        fix = "install it with your ROS 2 distribution, or start without it"
         raise ConfigError(
-            f"the ROS 2 package {node.package!r} is not installed here; {fix}."
+            f"the ROS 2 package {node.package!r} is not installed here; install it with your "
+            "ROS 2 distribution, or start without it."
         )
     return [str(prefix / "lib" / node.package / node.executable)]
 
@@ -207,5 +210,6 @@ class NodeProcess(ChildProcess):
             lines = text.strip().splitlines()
             shown = [line for line in lines if not line.startswith("[INFO]")] or lines
             last = " | ".join(shown[-LOG_LINES:]) or "no output"
-            reason = f"ended with code {code}: {last} (its log is {self.log})."
-            raise BackendError(f"{self.node} {reason}")
+            raise BackendError(
+                f"{self.node} ended with code {code}: {last} (its log is {self.log})."
+            )

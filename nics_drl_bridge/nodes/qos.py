@@ -68,8 +68,8 @@ requested again."""
 SENSOR_RELIABLE = make_profile(Offer(10))
 
 EVERY_COMMAND = make_profile(Offer(10))
-"""Commands in lock-step: each one moves the world, so a second publisher must not replace the
-first one's command unnoticed."""
+"""Commands in lock-step, each of which moves the world, and commands whose publisher the gate
+checks: a second publisher must not replace the first one's command unnoticed."""
 
 E_STOP = QoSProfile(
     history=rclpy_qos.HistoryPolicy.KEEP_ALL,
@@ -81,9 +81,6 @@ another publisher, must not push it out of the queue while nobody reads."""
 
 # commands and goals: only the newest counts, and it must arrive
 COMMAND = make_profile(Offer(1))
-# Commands whose publisher the gate checks: one that a second publisher sends at the same moment
-# must not replace the first one's unnoticed.
-EVERY_POLICY = make_profile(Offer(10))
 # `/tf`: like tf2's own, whose listeners request reliable
 TRANSFORMS = make_profile(Offer(100))
 # `/tf_static`, `map`: late joiners get them too
@@ -117,8 +114,10 @@ def override_qos(node: Node, topic: str, end: str) -> Iterator[dict[str, Any]]:
     given = get_given_values(node)
     names = sorted(name for name in given if name.startswith(prefix))
     if names and topic.rsplit("/", 1)[-1] in FIXED_TOPICS:
-        reason = "can't be overridden, because the robot's stop depends on it"
-        raise ConfigError(f"parameter {names[0]!r}: {reason}; leave it out.")
+        raise ConfigError(
+            f"parameter {names[0]!r}: can't be overridden, because the robot's stop depends on "
+            "it; leave it out."
+        )
     if not names:
         yield {}
         return
@@ -126,8 +125,9 @@ def override_qos(node: Node, topic: str, end: str) -> Iterator[dict[str, Any]]:
     try:
         yield {"qos_overriding_options": QoSOverridingOptions(kinds)}
     except RuntimeError as error:
-        fix = "correct it, or leave it out"
-        raise ConfigError(f"parameter {names[0]!r}: {error}; {fix}.") from None
+        raise ConfigError(
+            f"parameter {names[0]!r}: {error}; correct it, or leave it out."
+        ) from None
 
 
 class BridgeNode(Node):

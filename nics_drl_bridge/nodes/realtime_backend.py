@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
 from nics_drl_bridge import defaults, geometry
@@ -19,15 +20,14 @@ from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array, BackendFacts, RobotView, Start
+from nics_drl_bridge.middleware.ekf import START_STD
 from nics_drl_bridge.middleware.measurement import CMD_VEL, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.listener import holds
-from nics_drl_bridge.nodes.parameters import NO_POSE
-from nics_drl_bridge.nodes.robot_topics import (
-    RobotTopics,
-    declare_sensors,
-)
+from nics_drl_bridge.nodes.parameters import NO_POSE, STAMPED
+from nics_drl_bridge.nodes.robot_topics import RobotTopics
+from nics_drl_bridge.nodes.runner import declare_rows
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 POLL_S = 0.01
@@ -127,9 +127,7 @@ class RealtimeBackend:
         )
         if chosen.gated:
             command_timeout_s = math.inf  # a gate has its own timeout
-        _ = (
-            model.robot.cmd_vel_places
-        )  # refuse a robot without them before waiting for it
+        model.robot.require_cmd_vel()
         rehearse(model)
         self._link = Link(
             chosen.namespace,
@@ -147,7 +145,8 @@ class RealtimeBackend:
                 stamped = self._link.expects_stamped(CMD_VEL, chosen.timeout_s)
             elif stamped is None:
                 stamped = self._link.stamped
-            declare_sensors(self._link.node, stamped)
+            known = {STAMPED: stamped}
+            declare_rows(self._link.node, "sensors", "stamped", **known)
             self._topics = RobotTopics(self._link.node, model, now_ns=time.monotonic_ns)
             self._episodes = EpisodeServices(self._link, chosen.simulator, model, world)
             self._link.begin()
@@ -184,7 +183,7 @@ class RealtimeBackend:
                 raise StaleDataError(topic, math.inf, timeout_s)
         elif self._options.lays_map:
             with self._topics.lock:
-                self._topics.place(start.pose)
+                self._topics.place(start.pose, START_STD**2 * np.eye(3))
         self._misses = 0
         self._deadline_ns = time.monotonic_ns() + self._period_ns
         view, _ = self._take_view()
@@ -249,19 +248,16 @@ class RealtimeBackend:
         arrival time of the last one is still known.
         """
         now_ns = time.monotonic_ns()
+        silences_s = {}
         with self._topics.lock:
             cache = self._topics.middleware.cache
-            newest = dict(cache.newest)
-            arrived_ns = {topic: times[-1] for topic, times in cache.arrivals.items()}
-        latest_ns = max((datum.stamp_ns for datum in newest.values()), default=0)
-        silences_s = dict.fromkeys(self._topics.expected, math.inf)
-        for topic in self._topics.expected:
-            if topic in newest:
-                since_arrival_ns = now_ns - newest[topic].arrival_ns
-                behind_ns = latest_ns - newest[topic].stamp_ns
-                silences_s[topic] = max(since_arrival_ns, behind_ns) / NS_PER_S
-            elif topic in arrived_ns:
-                silences_s[topic] = (now_ns - arrived_ns[topic]) / NS_PER_S
+            latest_ns = self._topics.newest_ns
+            for topic in self._topics.expected:
+                silence_s = cache.silence_s(topic, now_ns)
+                if topic in cache.newest:
+                    behind_ns = latest_ns - cache.newest[topic].stamp_ns
+                    silence_s = max(silence_s, behind_ns / NS_PER_S)
+                silences_s[topic] = silence_s
         return silences_s
 
     def _is_vehicle(self) -> bool:

@@ -23,12 +23,7 @@ from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.command_types import (
-    SETTINGS,
-    describe_deaf_subscribers,
-    expect_stamped,
-    name_of,
-)
+from nics_drl_bridge.nodes.command_types import expect_stamped
 from nics_drl_bridge.nodes.parameters import IMU, STAMPED, list_drive_rows
 from nics_drl_bridge.recording.drive_log import DriveLog
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
@@ -176,23 +171,20 @@ class RecordNode(qos.BridgeNode):
             self._origin_ns = self._now_ns()
             return True
         if time.monotonic() - self._began > PATIENCE_S:
-            odom = ("odom", "nothing arrived")
-            command = (CMD_VEL, "nobody listened")
-            name, missing = odom if self._pose is None else command
+            name = CMD_VEL
+            reason = f"nobody listened within {PATIENCE_S:g} s"
+            if self._pose is None:
+                name = "odom"
+                reason = f"nothing arrived within {PATIENCE_S:g} s"
             fix = "start the robot, or correct namespace, ROS_DOMAIN_ID or remapping."
-            reason = f"{missing} within {PATIENCE_S:g} s"
-            if self._pose is not None and self._topic is not None:
-                deaf = describe_deaf_subscribers(self, CMD_VEL, self._stamped)
-                if deaf:
-                    setting = SETTINGS[name_of(not self._stamped)]
-                    fix = f"set {setting}, or leave it out."
-                    raise BackendError(f"topic {self._place(name)}: {deaf}; {fix}")
             raise BackendError(f"topic {self._place(name)}: {reason}; {fix}")
         return False
 
     def _place(self, topic: str) -> str:
-        place = f"namespace {self.get_namespace()!r}, ROS domain {self.context.get_domain_id()}"
-        return f"{self.resolve_topic_name(topic)!r} ({place})"
+        return (
+            f"{self.resolve_topic_name(topic)!r} (namespace {self.get_namespace()!r}, ROS domain "
+            f"{self.context.get_domain_id()})"
+        )
 
     def _go_on(self) -> None:
         self._guard()
@@ -210,10 +202,10 @@ class RecordNode(qos.BridgeNode):
         age = time.monotonic() - self._heard
         limit = runner.get_number(self, "odom_timeout")
         if age > limit:
-            reason = f"nothing new for {age:.2f} s (the limit is {limit:g} s)"
             place = self._place("odom")
             raise BackendError(
-                f"topic {place}: {reason}; find out why odometry stopped."
+                f"topic {place}: nothing new for {age:.2f} s (the limit is {limit:g} s); find "
+                "out why odometry stopped."
             )
         bound = self._plan.bound
         radius = self._plan.robot.footprint_radius
@@ -221,10 +213,10 @@ class RecordNode(qos.BridgeNode):
             self._start, self._start if self._pose is None else self._pose
         )
         if np.hypot(x, y) + radius > bound:
-            where = f"at x {x:.2f}, y {y:.2f} m from the start with a radius of {radius:g} m"
-            fix = "give a larger bound, less speed, or the robot's true parameters."
             raise BackendError(
-                f"the robot left its circle of {bound:g} m, {where}; {fix}"
+                f"the robot left its circle of {bound:g} m, at x {x:.2f}, y {y:.2f} m from the "
+                f"start with a radius of {radius:g} m; give a larger bound, less speed, or the "
+                "robot's true parameters."
             )
 
     def _send(self, command: Array) -> None:

@@ -17,29 +17,25 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, LaserScan
 
 from nics_drl_bridge import defaults, geometry
-from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
+from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, RobotView
+from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.sectors import Reader, match_reader
-from nics_drl_bridge.lidar.sensor import Sensor
-from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, from_device
+from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
 from nics_drl_bridge.middleware import measurement
-from nics_drl_bridge.middleware.ekf import ANYWHERE, START_STD
-from nics_drl_bridge.middleware.middleware import Middleware
+from nics_drl_bridge.middleware.ekf import START_STD
+from nics_drl_bridge.middleware.intake import Intake
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.command_types import KINDS, TypeWatch, name_of
 from nics_drl_bridge.nodes.conversions import INITIAL_POSE, read_initial_pose
 from nics_drl_bridge.nodes.parameters import (
     IMU,
     NO_POSE,
-    POSE_TYPES,
     STAMPED,
-    list_rows,
 )
-from nics_drl_bridge.nodes.runner import declare_row, get_flag, get_text
+from nics_drl_bridge.nodes.runner import get_choice, get_flag, get_text
 from nics_drl_bridge.recording import messages
-from nics_drl_bridge.recording.imu_axis import GyroReader
-from nics_drl_bridge.recording.topic_roles import IMU_NAMES, list_imu_topics
+from nics_drl_bridge.recording.topic_roles import list_imu_topics
 
 SILENCE_S = 5.0  # diagnostics call a topic stale that has been silent for this long [s]
 KINDS_OF_POSE = {
@@ -47,14 +43,7 @@ KINDS_OF_POSE = {
 }
 
 
-def declare_sensors(node: Node, stamped: bool | None = None) -> None:
-    """Declare a robot's sensors except scan and odometry, and the command type, if known."""
-    known = {} if stamped is None else {STAMPED: stamped}
-    for row in list_rows("sensors", "stamped", **known):
-        declare_row(node, row)
-
-
-class RobotTopics:
+class RobotTopics(Intake):
     """Subscribes to a robot's topics and keeps the middleware up to date.
 
     The first odometry defines `map`, or with a pose sensor the first pose. Readers in other threads
@@ -73,47 +62,35 @@ class RobotTopics:
         now_ns: Callable[[], int] | None = None,
     ) -> None:
         self._node = node
-        self._model = model
-        self._robot = model.robot
-        self._lidar = model.lidar
-        self._robot.require_cmd_vel()
+        pose_type = get_choice(node, "pose_type", (NO_POSE, *KINDS_OF_POSE))
+        self._posed = pose_type != NO_POSE
+        model.robot.require_cmd_vel()
         self.now_ns = now_ns or (lambda: int(node.get_clock().now().nanoseconds))
         self.lock = threading.RLock()
-        self.middleware = Middleware(model)
-        self.restart()
-        self._on_odometry = on_odometry
-        self._on_scan = on_scan
+        super().__init__(model, self._posed)
+        self._calls = {measurement.ODOM: on_odometry, measurement.SCAN: on_scan}
         self._on_lidar = on_lidar
+        self._lidar = model.lidar
         self._reader: Reader | None = Reader(model.lidar, backwards=False)
         self._header = b""
         self._told = ""
-        # pose and covariance of `initialpose`
-        self._placed: tuple[Array, Array] | None = None
         self._subscriptions: list[Any] = []
         kind = name_of(get_flag(node, STAMPED))
         self._types = TypeWatch(node, measurement.CMD_VEL, kind)
         self._subscribe(
             measurement.CMD_VEL, KINDS[kind], self._take_command, qos.COMMAND
         )
-        heard: dict[str, tuple[Any, Callable[[Any], None]]] = {
-            measurement.SCAN: (LaserScan, self._take_scan),
-            measurement.ODOM: (Odometry, self._take_odometry),
+        kinds: dict[str, Any] = {
+            measurement.SCAN: LaserScan,
+            measurement.ODOM: Odometry,
         }
-        pose_type = get_text(node, "pose_type")
-        self._posed = pose_type != NO_POSE
         if self._posed:
-            if pose_type not in POSE_TYPES:
-                fix = suggest(pose_type, (NO_POSE, *POSE_TYPES))
-                raise ConfigError(
-                    f"parameter 'pose_type': there is no {pose_type!r}; {fix}"
-                )
-            heard[measurement.POSE] = (KINDS_OF_POSE[pose_type], self._take_pose)
+            kinds[measurement.POSE] = KINDS_OF_POSE[pose_type]
         for sensor in model.sensors:
-            take_reading = partial(self._take_reading, sensor)
-            heard[sensor.name] = (conversions.find_sensor_type(sensor), take_reading)
-        for topic, (type_, take) in heard.items():
-            self._subscribe(topic, type_, take, qos.SENSOR)
-        self.expected = tuple(heard)
+            kinds[sensor.name] = conversions.find_sensor_type(sensor)
+        for topic, type_ in kinds.items():
+            self._subscribe(topic, type_, partial(self._take, topic), qos.SENSOR)
+        self.expected = tuple(kinds)
         self.expected_topics = self.expected
         self._subscribe_imu()
 
@@ -127,25 +104,14 @@ class RobotTopics:
         made = self._node.create_subscription(kind, topic, locked, quality)
         self._subscriptions.append(made)
 
-    @property
-    def lacks_gyro(self) -> bool:
-        """True if the model was made with a gyro, and nobody publishes one."""
-        if not self.optional:
-            return False
-        return not any(self._node.count_publishers(topic) for topic in IMU_NAMES)
-
     def _subscribe_imu(self) -> None:
         """Subscribe to the gyro if one is named or the model was made with one."""
         wanted = get_text(self._node, IMU)
         topics = list_imu_topics(wanted, self._model.gyro)
         self._imu_topic = ""  # the first topic that is heard
-        self._gyro = GyroReader()
         for topic in topics:
-            self._subscribe(topic, Imu, partial(self._take_imu, topic), qos.SENSOR)
-        self.optional: tuple[str, ...] = ()  # used if they arrive
-        if wanted == defaults.IMU_TOPIC and topics:
-            self.optional = (measurement.IMU,)
-        elif topics:
+            self._subscribe(topic, Imu, partial(self._take_imu_of, topic), qos.SENSOR)
+        if topics and wanted != defaults.IMU_TOPIC:  # those are used if they arrive
             self.expected = (*self.expected, measurement.IMU)
             self.expected_topics = (*self.expected_topics, wanted)
 
@@ -157,21 +123,8 @@ class RobotTopics:
 
     def restart(self) -> None:
         """Clear all state; the next odometry starts again."""
-        self._started = False
-        self._since_ns = 0
-        self._placed = None
+        super().restart()
         self.frames = ("", "")  # of the newest odometry: its own, and the robot's
-        self.middleware.reset(0, np.zeros(3))
-
-    def begin(self, stamp_ns: int, pose: Array) -> None:
-        """Clear all state before a stamp [ns] at which the robot stands at a pose (3,)."""
-        self._started = True
-        self._since_ns = stamp_ns
-        self.middleware.reset(stamp_ns, pose)
-
-    def place(self, pose: Array) -> None:
-        """Define `map` so that the robot's present pose in it is `pose` (3,)."""
-        self.middleware.place(pose, START_STD**2 * np.eye(3))
 
     def subscribe_initial_pose(self) -> None:
         """Subscribe to `initialpose`, the robot's pose in the map."""
@@ -184,19 +137,14 @@ class RobotTopics:
             pose = read_initial_pose(message, get_text(self._node, "map_frame"))
             covariance = START_STD**2 * np.eye(3)
             if self._posed:  # otherwise nothing corrects this pose: it defines the map
-                _, reported = conversions.pose_from_ros(message)
+                reported = messages.read_pose_covariance(message)
                 checked = measurement.check_covariance(reported, 3, START_STD)
                 covariance = covariance if checked is None else checked
-            self._placed = pose, covariance
-        except ValueError as error:
-            fix = "give a valid one, or zeros. The estimate stays as it is."
-            logger.error(f"{INITIAL_POSE}: {error}; {fix}")
+        except (ValueError, ConfigError) as error:
+            reason = str(error).rstrip(".")
+            logger.error(f"{INITIAL_POSE}: {reason}. The estimate stays as it is.")
             return
-        except ConfigError as error:
-            logger.error(f"{error} The estimate stays as it is.")
-            return
-        if self._started:
-            self.middleware.place(*self._placed)
+        self.place(pose, covariance)
         logger.info(
             f"the robot is at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad"
         )
@@ -222,44 +170,38 @@ class RobotTopics:
         return is_placed or measurement.POSE in self.middleware.cache.newest
 
     def list_silent(self, topics: Iterable[str], longest_s: float) -> list[str]:
-        """Return the topics without a usable datum for so long [s]."""
-        newest = self.middleware.cache.newest
-        oldest_ns = self.now_ns() - longest_s * NS_PER_S
-        return [
-            topic
-            for topic in topics
-            if topic not in newest or newest[topic].arrival_ns < oldest_ns
-        ]
+        """Return those of some topics without a usable datum for so long [s]."""
+        cache = self.middleware.cache
+        now_ns = self.now_ns()
+        return [topic for topic in topics if cache.silence_s(topic, now_ns) > longest_s]
 
     def view(self) -> RobotView:
         """Return the view at the stamp of the newest datum."""
         return self.middleware.view(self.newest_ns)
 
-    def _take_scan(self, message: LaserScan) -> None:
-        stamp = messages.get_stamp(message)
-        if stamp < self._since_ns:
-            return
-        reader = self._find_reader(message)
-        if reader is None:
-            self.middleware.cache.reject(measurement.SCAN, "another lidar")
-            return
-        ordered = reader.ordered(np.asarray(message.ranges, np.float32))
-        ranges = from_device(np.ascontiguousarray(ordered), reader.lidar)
-        if (
-            self.middleware.scan(stamp, self.now_ns(), ranges)
-            and self._on_scan is not None
-        ):
-            self._on_scan(stamp)
+    def _take(self, role: str, message: Any) -> None:
+        if role == measurement.ODOM:
+            self.frames = message.header.frame_id, message.child_frame_id
+        used = self.take(role, self.now_ns(), message)
+        call = self._calls.get(role)
+        if used and call is not None:
+            call(messages.get_stamp(message))
 
-    def _find_reader(self, message: LaserScan) -> Reader | None:
+    def _take_imu_of(self, topic: str, message: Imu) -> None:
+        self._imu_topic = self._imu_topic or topic
+        if topic == self._imu_topic:
+            self._take(measurement.IMU, message)
+
+    def find_reader(self, scan: LaserScan) -> Reader | None:
+        """Return the reader for a scan's header; None if it can't be used."""
         # bytes, because NaN does not equal itself
         header = np.array(
             [
-                message.angle_min,
-                message.angle_increment,
-                message.range_min,
-                message.range_max,
-                len(message.ranges),
+                scan.angle_min,
+                scan.angle_increment,
+                scan.range_min,
+                scan.range_max,
+                len(scan.ranges),
             ]
         ).tobytes()
         if header == self._header or self._on_lidar is None:
@@ -268,10 +210,10 @@ class RobotTopics:
         self._reader = None
         upside_down = get_flag(self._node, "lidar_upside_down")
         try:
-            values = (float(getattr(message, name)) for name in ScanHeader._fields)
+            values = (float(getattr(scan, name)) for name in ScanHeader._fields)
             reader = match_reader(
                 ScanHeader(*values),
-                len(message.ranges),
+                len(scan.ranges),
                 self._model.lidar,
                 upside_down,
             )
@@ -288,50 +230,7 @@ class RobotTopics:
             self._told = str(error)
         return self._reader
 
-    def _take_odometry(self, message: Odometry) -> None:
-        stamp = messages.get_stamp(message)
-        pose, twist = conversions.odometry_from_ros(message)
-        self.frames = message.header.frame_id, message.child_frame_id
-        if not self._started and np.isfinite(pose).all():
-            self.middleware.reset(stamp, pose, *((ANYWHERE,) if self._posed else ()))
-            self._started = True
-            if self._placed is not None:
-                self.middleware.place(*self._placed)
-        variance = messages.read_turn_variance(message)
-        used = self.middleware.odometry(stamp, self.now_ns(), pose, twist, variance)
-        newest = self.middleware.cache.newest
-        if (
-            used
-            and self._on_odometry is not None
-            and newest[measurement.ODOM].stamp_ns == stamp
-        ):
-            self._on_odometry(stamp)
-
-    def _take_pose(self, message: PoseStamped | PoseWithCovarianceStamped) -> None:
-        measured = conversions.pose_from_ros(message)
-        self.middleware.pose(messages.get_stamp(message), self.now_ns(), *measured)
-
-    def _take_imu(self, topic: str, message: Imu) -> None:
-        self._imu_topic = self._imu_topic or topic
-        if topic != self._imu_topic:
-            return
-        measured = self._gyro.read(message)
-        if measured is None:
-            self.middleware.cache.reject(measurement.IMU, "no angular velocity")
-        else:
-            self.middleware.imu(messages.get_stamp(message), self.now_ns(), *measured)
-
-    def _take_reading(self, sensor: Sensor, message: Any) -> None:
-        try:
-            reading = sensor.read(message)
-        except ValueError as error:
-            self.middleware.cache.reject(sensor.name, str(error))
-        else:
-            self.middleware.sense(
-                sensor.name, messages.get_stamp(message), self.now_ns(), reading
-            )
-
     def _take_command(self, message: Twist | TwistStamped) -> None:
         self.middleware.command(
-            None, self._robot.from_cmd_vel(conversions.twist_from_ros(message))
+            None, self._model.robot.from_cmd_vel(conversions.twist_from_ros(message))
         )

@@ -37,11 +37,7 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.listener import open_context, spin
-from nics_drl_bridge.nodes.own_process import (
-    end_at_once,
-    list_ending_signals,
-    list_log_arguments,
-)
+from nics_drl_bridge.nodes.own_process import list_ending_signals, list_log_arguments
 from nics_drl_bridge.nodes.parameters import (
     Row,
     find_frame_fault,
@@ -78,44 +74,41 @@ def run_node(
     A known error prints one sentence, and ends with exit code 2.
     """
     stopping = threading.Event()
-    for number in list_ending_signals():
-        signal.signal(number, lambda *_: stopping.set())
     words = sys.argv if args is None else args
     try:
-        with end_at_once():
-            context = open_context([*words, *list_log_arguments(words)])
-        return run_until_end(make, context, stopping, sole_name)
+        context = open_context([*words, *list_log_arguments(words)])
+        with open_node(make, context, sole_name) as node:
+            for number in list_ending_signals():
+                signal.signal(number, lambda *_: stopping.set())
+            spin(node, stopping)
+        return node
     except INPUT_ERRORS as error:
         sys.stderr.write(f"{explain(error)}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
 
 
-def run_until_end(
-    make: Callable[..., Node],
-    context: Context,
-    stopping: threading.Event,
-    sole_name: str = "",
-) -> Any:
-    """Make a node by `make(context=...)`, spin it until the end, and destroy it; return it.
+@contextlib.contextmanager
+def open_node(
+    make: Callable[..., Node], context: Context, sole_name: str = ""
+) -> Iterator[Any]:
+    """Make a node by `make(context=...)` and start it; in the end, stop and destroy it.
 
-    The end is an event, or the end of the context, which belongs to the node.
+    The context belongs to the node, and is shut down in the end, too.
     """
-    with contextlib.ExitStack() as undo:
+    with ExitStack() as undo:
         undo.callback(context.try_shutdown)
-        with end_at_once():
-            if sole_name:
-                undo.enter_context(claim_name(context, sole_name))
-            node = make(context=context)
-            undo.callback(_end, node)
-            if hasattr(node, "start"):
-                node.start()
+        if sole_name:
+            undo.enter_context(claim_name(context, sole_name))
+        node = make(context=context)
+        undo.callback(_end, node)
+        if hasattr(node, "start"):
+            node.start()
         gc.collect()  # now, because later it may take 0.1 s while the robot moves
         for sentence in explain_ignored_values(node):  # rclpy ignores them silently
             node.get_logger().warning(sentence)
         if getattr(node, "state", ACTIVE) == ACTIVE:
             node.get_logger().info("running")
-        spin(node, stopping)
-    return node
+        yield node
 
 
 def _end(node: Any) -> None:
@@ -147,11 +140,9 @@ def claim_name(context: Context, name: str) -> Iterator[None]:
         try:
             claim.bind(f"\0nics_drl_bridge {key}")
         except OSError:
-            fix = (
-                "end it, or give this one a namespace: `--ros-args -r __ns:=/robot_2`."
-            )
             raise BackendError(
-                f"a node {whole!r} already runs in ROS domain {domain}; {fix}"
+                f"a node {whole!r} already runs in ROS domain {domain}; end it, or give this "
+                "one a namespace: `--ros-args -r __ns:=/robot_2`."
             ) from None
         yield
 
@@ -193,6 +184,16 @@ def get_number(node: Node, name: str) -> float:
 def get_flag(node: Node, name: str) -> bool:
     """Return the value of a parameter that is true or false."""
     return bool(node.get_parameter(name).value)
+
+
+def get_choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
+    """Return a parameter that must be one of `valid`. Raises ConfigError with the nearest word."""
+    value = get_text(node, name)
+    if value not in valid:
+        raise ConfigError(
+            f"parameter {name!r}: unknown value {value!r}; {suggest(value, valid)}"
+        )
+    return value
 
 
 def declare_row(node: Node, row: Row) -> Any:
@@ -242,11 +243,14 @@ def explain_ignored_values(node: Node) -> list[str]:
         if name == SHARED or node.has_parameter(name) or ignores(name):
             continue
         if not name.startswith(qos.OVERRIDES):
-            fix = f"its value is ignored; {suggest(name, names)}"
-            sentences.append(f"there is no parameter {name!r}, {fix}")
+            sentences.append(
+                f"there is no parameter {name!r}, its value is ignored; {suggest(name, names)}"
+            )
         elif has_topics:
-            why = "the node has no such publisher or subscription"
-            sentences.append(f"parameter {name!r} is ignored: {why}.")
+            sentences.append(
+                f"parameter {name!r} is ignored: the node has no such publisher or "
+                "subscription."
+            )
     return sentences
 
 
@@ -272,12 +276,9 @@ def open_parts(kind: str, node: Node) -> list[Any]:
     leader, which may drive the robot to goals of its own; its methods are those of
     `extras.nav2.follow_path.PathActions`. Raises BridgeError.
     """
-    installed = extensions.find_extensions(PARTS)
-    names = [name for name in installed if name.startswith(f"{kind}.")]
-    if not names:  # of an environment that was made before this package had parts
-        fix = "install nics_drl_bridge again."
-        node.get_logger().warning(f"no parts of a {kind} are installed; {fix}")
-    parts = [extensions.load(PARTS, name)(node) for name in names]
+    names = extensions.find_extensions(PARTS)
+    chosen = [name for name in names if name.startswith(f"{kind}.")]
+    parts = [extensions.load(PARTS, name)(node) for name in chosen]
     return [part for part in parts if part is not None]
 
 
@@ -386,15 +387,16 @@ class ManagedNode(BridgeNode, LifecycleNode):
             (*self.get_parameters_by_prefix("").values(), *parameters)
         )
         if late and self.state != UNCONFIGURED:
-            lead = f"`ros2 lifecycle set {self.get_fully_qualified_name()} deactivate`"
-            fix = f"return it to unconfigured by {lead}, then `cleanup`."
-            reason = f"parameter {late[0]!r} is read when the node is configured; {fix}"
+            reason = (
+                f"parameter {late[0]!r} is read when the node is configured; return it to "
+                f"unconfigured by `ros2 lifecycle set {self.get_fully_qualified_name()} "
+                "deactivate`, then `cleanup`."
+            )
         return SetParametersResult(successful=not reason, reason=reason)
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Configure the node; a failure leaves it unconfigured."""
-        with end_at_once():  # opening a policy may compile; nothing was commanded yet
-            done = self._attempt(self.configure, INACTIVE)
+        done = self._attempt(self.configure, INACTIVE)
         if done == FAILURE:
             self.undo.close()
         return done

@@ -48,14 +48,15 @@ from nics_drl_bridge.nodes.frames import (
 from nics_drl_bridge.nodes.link import EPISODE_NS, get_fingerprints
 from nics_drl_bridge.nodes.runner import OK, WARN
 from nics_drl_bridge.pacing import RealTime, TopicPace
+from nics_drl_bridge.recording.messages import get_stamp, read_command
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
 from nics_drl_bridge.sim.occupancy import occupancy, standing
 from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import check_inside
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 CLOCK = "/clock"
 CLOCK_NS = 15_000_000  # longest time between two ticks of it in real time
-WATCH_S = 2.0  # between two checks for other publishers of /clock
 MAP_S = 0.2  # between two checks of what stands in the world
 QUIET_S = 5.0  # between two equal warnings
 LAGGING_S = 5.0  # diagnostics warn for this long after it fell behind real time
@@ -223,10 +224,8 @@ class RobotPort:
         self._obey(stamp_ns, twist, self._model.robot.from_cmd_vel)
 
     def _take_ackermann(self, message: Any) -> None:
-        drive = message.drive
-        stamp_ns = conversions.stamp_from_ros(message.header.stamp)
-        fields = (drive.speed, 0.0, drive.steering_angle)
-        self._obey(stamp_ns, fields, self._model.robot.from_fields)
+        fields = read_command(message)
+        self._obey(get_stamp(message), fields, self._model.robot.from_fields)
 
     def _obey(
         self,
@@ -235,9 +234,10 @@ class RobotPort:
         read: Callable[[Sequence[float]], Array],
     ) -> None:
         if stamp_ns and self._node.is_too_old(stamp_ns):
-            why = "its stamp is older than command_timeout"
-            fix = "do both ends use one clock (use_sim_time)?"
-            self._complain(f"a command is ignored, because {why}; {fix}")
+            self._complain(
+                "a command is ignored, because its stamp is older than command_timeout; do both "
+                "ends use one clock (use_sim_time)?"
+            )
         elif all(map(math.isfinite, fields)):
             self._node.take_command(self, read(fields))
         else:
@@ -317,7 +317,7 @@ class MapTopic:
         shown = (world, member, poses)
         if shown != self._shown:
             self._shown = shown
-            grid = occupancy(simulator.world.members[member], still, self._cell)
+            grid = occupancy(world.world, still, self._cell)
             frame = self._node.map_frame
             self._map.publish(conversions.map_to_ros(grid, self._node.now_ns, frame))
 
@@ -386,11 +386,10 @@ class DeviceNode(qos.BridgeNode):
     def _open_topics(self) -> None:
         self.outbox = Outbox()
         self._clock_topic = self.create_publisher(Clock, CLOCK, qos.SENSOR_RELIABLE)
-        self._clocks = {self.get_fully_qualified_name()}
         self._ports: list[RobotPort] = []
         self.map_topic = MapTopic(self)
         for name in self._names:
-            self._open_robot(name)
+            self._ports.append(RobotPort(self, name))
         self._open_transforms()
         runner.serve(self, "~/reset", self._reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
@@ -399,19 +398,16 @@ class DeviceNode(qos.BridgeNode):
         self.create_service(SelfTest, "~/self_test", self._test)
         runner.diagnose(self, PART, self._look)
 
-    def _open_robot(self, name: str) -> None:
-        self._ports.append(RobotPort(self, name))
-
     def add_robot(self, namespace: str) -> None:
         """Open the topics of the robot that was added to the device last."""
-        self._open_robot(namespace)
+        self._ports.append(RobotPort(self, namespace))
         self._publish_mounts()
 
     def reopen_robots(self) -> None:
         """Open the topics of exactly the robots of the start."""
         self.remove_robots(range(len(self._ports)))
         for name in self._names:
-            self._open_robot(name)
+            self._ports.append(RobotPort(self, name))
         self._publish_mounts()
 
     def remove_robots(self, gone: Sequence[int]) -> None:
@@ -437,8 +433,6 @@ class DeviceNode(qos.BridgeNode):
             self._fixed.publish(self._transforms(transforms=list(mounts)))
 
     def _start_time(self) -> None:
-        # On the steady clock: with use_sim_time the node's clock would wait for this very node.
-        runner.call_periodically(self, WATCH_S, self._watch)
         step_ns = self.timing.step_ns
         self._odom_pace = TopicPace(self.timing.odom_ns, step_ns)
         self._scan_pace = TopicPace(self.timing.scan_ns, step_ns)
@@ -458,15 +452,6 @@ class DeviceNode(qos.BridgeNode):
             runner.call_periodically(
                 self, 0.0, lambda: None if self.paused else self.step()
             )
-
-    def _watch(self) -> None:
-        names = set(qos.list_owners(self.get_publishers_info_by_topic(CLOCK)))
-        for name in names - self._clocks:
-            self.get_logger().warning(
-                f"{name} publishes {CLOCK} too, and nodes with use_sim_time hear both; give each "
-                "simulator a ROS_DOMAIN_ID of its own, or let one run all robots (`robots`)."
-            )
-        self._clocks |= names
 
     def _look(self) -> runner.Condition:
         facts = {
@@ -520,23 +505,14 @@ class DeviceNode(qos.BridgeNode):
     def put_robot(self, port: RobotPort, message: PoseWithCovarianceStamped) -> None:
         """Put a robot at the pose of an `initialpose`, if it can be used."""
         logger = self.get_logger()
-        simulator = self.device.simulator
         try:
             pose = read_initial_pose(message, self.map_frame)
-            world = simulator.world.members[int(simulator.data.member[0])]
-            x1, y1, x2, y2 = world.extent
-            if not (x1 <= pose[0] <= x2 and y1 <= pose[1] <= y2):
-                where = f"x {x1:g} to {x2:g} m, y {y1:g} to {y2:g} m"
-                place = f"x {pose[0]:.2f} m, y {pose[1]:.2f} m"
-                raise ConfigError(
-                    f"{INITIAL_POSE}: {place} is outside the world ({where})."
-                )
+            check_inside("the pose", self.device.world, pose[0], pose[1])
         except ConfigError as error:
-            logger.error(f"{error} The robot stays where it is.")
+            logger.error(f"{INITIAL_POSE}: {error} The robot stays where it is.")
             return
-        robot = self._ports.index(port)
-        simulator.put_robot(robot, pose, np.zeros(simulator.data.state.shape[-1]))
-        self.device.put(robot)
+        at_rest = np.zeros(len(self.model.robot.state))
+        self.device.put(self._ports.index(port), pose, at_rest)
         logger.info(
             f"the robot was put at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad"
         )
@@ -554,8 +530,10 @@ class DeviceNode(qos.BridgeNode):
         if self._real_time.lost(steady_ns, self.now_ns):
             self._lags += 1
             self._lagged_s = time.monotonic()
-            fix = "choose a lower rate, scan_rate or odom_rate, or fewer robots"
-            warning = f"this machine does not keep up with real time; {fix}"
+            warning = (
+                "this machine does not keep up with real time; choose a lower rate, scan_rate or "
+                "odom_rate, or fewer robots"
+            )
             self.get_logger().warning(warning, throttle_duration_sec=5.0)
             self._real_time.begin(steady_ns, self.now_ns + self.timing.step_ns)
         behind = self._real_time.behind(steady_ns, self.now_ns)
@@ -685,7 +663,7 @@ class DeviceNode(qos.BridgeNode):
 def declare_renderer(node: Node, default: Renderer) -> Renderer:
     """Declare the parameter `renderer`, and return its value."""
     runner.declare_rows(node, "renderer", renderer=default)
-    return cast(Renderer, device_parameters.get_choice(node, "renderer", RENDERERS))
+    return cast(Renderer, runner.get_choice(node, "renderer", RENDERERS))
 
 
 def make_fast_simulator(

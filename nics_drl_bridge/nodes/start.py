@@ -8,7 +8,6 @@ import sys
 import textwrap
 import time
 import traceback
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -17,7 +16,6 @@ from nics_drl_bridge.nodes import own_process, transport
 
 HELP = ("-h", "--help")
 ROS = "--ros-args"
-END = "--"
 WIDTH = 100
 
 
@@ -66,21 +64,6 @@ def format_value(value: Any) -> str:
     return f".{text}" if text == "nan" else text
 
 
-def find_fault(node: str, words: Sequence[str]) -> str:
-    """Return a sentence about the first word that is not an argument of a node, or ""."""
-    ours = True  # False for the words that ROS 2 itself checks
-    for word in words:
-        if word in (ROS, END):
-            ours = word == END
-        elif ours:
-            example = f"-p {word}" if ":=" in word else "-p NAME:=VALUE"
-            fix = f"write parameters and remappings after {ROS}, as in `{node} {ROS} {example}`"
-            return (
-                f"{node}: there is no argument {word!r}; {fix}, or see `{node} --help`."
-            )
-    return ""
-
-
 def start(node: str, args: list[str] | None = None) -> None:
     """Run a node by its name and end the process; bad input gives one sentence and exit code 2."""
     for number in own_process.list_ending_signals():  # importing the node takes seconds
@@ -89,10 +72,6 @@ def start(node: str, args: list[str] | None = None) -> None:
     if any(word in HELP for word in words):
         sys.stdout.write(format_help(node))
         own_process.leave(0)
-    sentence = find_fault(node, words)
-    if sentence:
-        sys.stderr.write(f"{sentence}\n")
-        own_process.leave(EXIT_BAD_INPUT)
     own_process.forward_output(own_process.name_log_file(node, words))
     faulthandler.enable()  # shows where Python was when a library crashes
     # In the format of the ROS 2 log, which is available only seconds later.
@@ -101,7 +80,6 @@ def start(node: str, args: list[str] | None = None) -> None:
     code: Any = 0
     try:
         transport.set_transport(os.environ)
-        own_process.begin_own_process()
         gc.disable()  # what is imported stays, so that looking for garbage finds none
         main = _load_main(node)
         gc.freeze()

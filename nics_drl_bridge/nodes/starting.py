@@ -8,8 +8,9 @@ the parameter file, unless its description says otherwise.
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ from nics_drl_bridge.config import (
     PACKAGE,
     find_config,
     list_shipped,
+    parse_yaml,
     read_text,
     share_folder,
 )
@@ -25,6 +27,7 @@ from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.nodes.parameters import BASE_FRAME, IMU, STAMPED, name_fleet
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
+FILE = Path(__file__).with_name("launches.yaml")
 STATE_PUBLISHER = "robot_state_publisher"
 RVIZ = "rviz2"
 BASE_LINK = "base_link"  # base frame by default
@@ -94,7 +97,6 @@ class Setup:
 
     def __init__(self, values: Values) -> None:
         self.values: dict[str, Any] = dict(values)
-        # What is wrong is refused here, before any node is started.
         for name in FLAGS:
             word = self[name]
             if word.lower() not in FLAG_WORDS:
@@ -102,15 +104,9 @@ class Setup:
                     f"launch argument {name!r} is {word!r}; give true or false."
                 )
             self.values[name] = FLAG_WORDS[word.lower()]
-        for name in ("params_file", "urdf", "policy"):
-            file = self[name]
-            is_file = name != "policy" or file.endswith((".onnx", ".yaml", ".yml"))
-            if file and is_file and not Path(file).is_file():
-                raise ConfigError(f"{name} {file}: no such file; check the path.")
-        if self["world"] and self["world"] not in list_shipped("worlds"):
-            from nics_drl_bridge.sim.world_set import load_worlds
-
-            load_worlds(self["world"])  # it takes a second
+        file = self["params_file"]
+        if file and not Path(file).is_file():
+            raise ConfigError(f"params_file {file}: no such file; check the path.")
         self.model = self["model"] or DEFAULT_ROBOT
         shipped = share_folder() / "urdf" / f"{self.model}.urdf"
         self._opened: Any = None if shipped.is_file() else open_slowly(self.model)
@@ -136,11 +132,11 @@ class Setup:
 
     def describe_robot(self) -> str:
         """Return the URDF of the robot. Raises ConfigError if no argument names the robot."""
-        own_file = self["params_file"] not in ("", find_shipped_parameters())
+        own_file = self["params_file"] not in ("", str(find_config("bridge", "nodes")))
         if own_file and not (self["model"] or self["urdf"]):
-            fix = "say model:=ROBOT or urdf:=FILE, or use_robot_state_pub:=false"
             raise ConfigError(
-                f"{STATE_PUBLISHER} has to know which robot it is; {fix}."
+                f"{STATE_PUBLISHER} has to know which robot it is; say model:=ROBOT or "
+                "urdf:=FILE, or use_robot_state_pub:=false."
             )
         base = self[BASE_FRAME] or BASE_LINK
         laser = self["laser_frame"]
@@ -186,9 +182,6 @@ class Setup:
             arguments=arguments,
             log_level=self["log_level"],
         )
-
-
-Part = Callable[[Setup], Iterator[NodeStart]]
 
 
 def simulator(setup: Setup) -> Iterator[NodeStart]:
@@ -258,76 +251,39 @@ class Launch:
     """Parts that are started together; their arguments may have other defaults here."""
 
     about: str
-    parts: Sequence[Part]
+    parts: Sequence[str]  # names in `PARTS`
     defaults: Values = field(default_factory=dict)
     left_out: Sequence[str] = ()  # names of arguments
 
     @property
     def arguments(self) -> list[Argument]:
         """The arguments that choose and configure the nodes."""
-        stamped = (
-            "Use TwistStamped for cmd_vel; "
-            "empty: params_file, else TwistStamped on Kilted and newer"
-        )
-        limits = "Limits of the gate; empty: those of the model, if given, else from params_file"
-        start = "Start x, y, heading [m, m, rad] of each robot; empty: drawn at random"
-        required = (
-            "Require e_stop: if never received, it counts as pressed; empty: true"
-        )
-        kinds = ("simulator", "mujoco", "dart")
-        fleet = "Number of robots, or their namespaces, as in '[a, b]'"
+        groups = ["all", *self.parts]
+        if "simulator" in self.parts or "bridge" in self.parts:
+            groups.insert(1, "own_nodes")
         installed = "true" if find_prefix(STATE_PUBLISHER) else "false"
-        view = str(share_folder() / "config" / "rviz" / "bridge.rviz")
-        from_file = "empty: from params_file"
-        every: list[tuple[Any, ...]] = [
-            ("model", "", f"Shipped robot, or folder of a model; {from_file}"),
-            ("namespace", "", "Namespace of the robot, or of the fleet"),
-            (BASE_FRAME, "", f"Frame of the robot; {from_file}"),
-            ("use_sim_time", "false", "Use /clock"),
-            ("log_level", "info", "Log level of all nodes"),
-        ]
-        if simulator in self.parts or bridge in self.parts:
-            every += [
-                ("params_file", find_shipped_parameters(), "Parameters of all nodes"),
-                ("stamped", "", stamped),
-            ]
-        if simulator in self.parts:
-            every += [
-                ("simulator", kinds[0], "The fast simulator, MuJoCo or DART", kinds),
-                ("world", "", f"Shipped world, or a YAML file; {from_file}"),
-                ("robots", "1", fleet),
-                ("start", "", start),
-                ("laser_frame", "", f"Frame of the lidar; {from_file}"),
-            ]
-        if bridge in self.parts:
-            every += [
-                ("policy", "", f"Policy file, or name of a policy; {from_file}"),
-                ("limits", "", limits),
-                (
-                    "autostart",
-                    "true",
-                    "Configure and activate managed nodes automatically",
-                ),
-                (IMU, "", f"Topic of the gyro, auto or none; {from_file}"),
-                ("e_stop_required", "true", required),
-            ]
-        if description in self.parts:
-            every += [
-                ("use_robot_state_pub", installed, "Start robot_state_publisher"),
-                ("urdf", "", "URDF file of the robot; empty: the model's"),
-                ("rviz", "false", "Start RViz"),
-                ("rviz_config", view, "Configuration file for RViz"),
-            ]
-        return [
-            Argument(name, self.defaults.get(name, default), *rest)
-            for name, default, *rest in every
-            if name not in self.left_out
-        ]
+        arguments = []
+        for group in groups:
+            for name, entry in read_launches()["arguments"][group].items():
+                default = entry.get("default", "")
+                default = default.format(installed=installed, share=share_folder())
+                default = self.defaults.get(name, default)
+                choices = tuple(entry.get("choices", ()))
+                argument = Argument(name, default, entry["about"], choices)
+                if name not in self.left_out:
+                    arguments.append(argument)
+        return arguments
 
     def nodes(self, values: Values) -> list[NodeStart]:
         """Return the nodes for the given arguments. Raises BridgeError."""
         setup = Setup(complete(self.arguments, values))
-        return list(chain.from_iterable(part(setup) for part in self.parts))
+        return list(chain.from_iterable(PARTS[part](setup) for part in self.parts))
+
+
+@cache
+def read_launches() -> dict[str, Any]:
+    """Return the arguments by the parts that have them, and the launches by name."""
+    return parse_yaml(read_text(FILE), str(FILE))
 
 
 def complete(arguments: Sequence[Argument], chosen: Values) -> dict[str, str]:
@@ -373,16 +329,11 @@ def parse_start(start: str) -> list[float] | None:
     except ValueError:
         numbers = [0.0]
     if len(numbers) % 3:
-        fix = (
-            "give x, y, heading [m, rad] of each robot, as in start:='[1.0, 0.0, 1.57]'"
+        raise ConfigError(
+            f"launch argument 'start' is {start!r}; give x, y, heading [m, rad] of each robot, "
+            "as in start:='[1.0, 0.0, 1.57]'."
         )
-        raise ConfigError(f"launch argument 'start' is {start!r}; {fix}.")
     return numbers or None
-
-
-def find_shipped_parameters() -> str:
-    """Return the path of the parameter file that is used by default."""
-    return str(find_config("bridge", "nodes"))
 
 
 def find_prefix(package: str) -> Path | None:
@@ -396,33 +347,10 @@ def find_prefix(package: str) -> Path | None:
     return None
 
 
-SIMULATED = {"use_sim_time": "true", "e_stop_required": "false"}
+PARTS = {"simulator": simulator, "bridge": bridge, "description": description}
+
+
 LAUNCHES = {
-    "simulation": Launch(
-        "A simulator and, on its topics, everything that runs on a vehicle.",
-        [simulator, bridge, description],
-        SIMULATED,
-    ),
-    # Without any `e_stop` message, a vehicle stays stopped.
-    "vehicle": Launch(
-        "Gate, middleware and policy of a vehicle; start the drivers of lidar and base separately.",
-        [bridge, description],
-        left_out=["e_stop_required"],
-    ),
-    "fleet": Launch(
-        "Several robots in one simulator, each with gate, middleware and policy.",
-        [simulator, bridge, description],
-        {**SIMULATED, "robots": "2"},
-    ),
-    "simulator": Launch(
-        "Only a simulator, to be driven through cmd_vel from elsewhere.",
-        [simulator, description],
-        SIMULATED,
-    ),
-    "bridge": Launch("Gate, middleware and policy on the topics of a robot.", [bridge]),
-    "description": Launch(
-        "The description of a robot: robot_state_publisher with its URDF, and RViz.",
-        [description],
-    ),
+    name: Launch(**entry) for name, entry in read_launches()["launches"].items()
 }
 """Every launch by name, for `nics up` and the files in `launch/`."""

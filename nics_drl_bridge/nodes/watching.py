@@ -16,8 +16,9 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.listener import Listener
-from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
+from nics_drl_bridge.nodes.listener import SpunNode
+from nics_drl_bridge.nodes.robot_topics import RobotTopics
+from nics_drl_bridge.nodes.runner import declare_rows
 from nics_drl_bridge.sim.world import World, check_place
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
@@ -63,10 +64,9 @@ class RosSource:
         self._map_frame = "map"
         self._new_lidar: LidarSpec | None = None
         self._drawn_ns = 0
-        self._node = Listener(
-            NAME, domain_id, parse_namespace(namespace), has_parameters=True
-        )
-        declare_sensors(self._node)
+        self._spun = SpunNode(NAME, domain_id, parse_namespace(namespace))
+        self._node = self._spun.node
+        declare_rows(self._node, "sensors", "stamped")
         self._topics = RobotTopics(
             self._node, model, on_lidar=partial(setattr, self, "_new_lidar")
         )
@@ -78,7 +78,7 @@ class RosSource:
             (DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS),
         ):
             self._node.create_subscription(kind, topic, take, quality)
-        self._node.start()
+        self._spun.start()
 
     def _take_truth(self, message: Odometry) -> None:
         pose = conversions.odometry_from_ros(message)[0]
@@ -150,14 +150,11 @@ class RosSource:
         if request.kind == "goal":
             if self._within is not None:
                 check_place("goal", self._within, request.x, request.y)
-            message = PoseStamped()
-            message.header.stamp = self._node.get_clock().now().to_msg()
-            message.header.frame_id = self._map_frame
-            message.pose.position.x, message.pose.position.y = request.x, request.y
-            message.pose.orientation.w = 1.0
-            self._goals.publish(message)
+            goal = (request.x, request.y, 0.0)
+            now_ns = self._topics.now_ns()
+            self._goals.publish(conversions.pose_to_ros(goal, now_ns, self._map_frame))
         return False
 
     def close(self) -> None:
         """Close the node and its context."""
-        self._node.close()
+        self._spun.close()

@@ -10,7 +10,8 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.interface import NS_PER_S, Array
-from nics_drl_bridge.nodes.conversions import PLANAR, compute_heading
+from nics_drl_bridge.nodes.conversions import compute_heading
+from nics_drl_bridge.recording.messages import PLANAR
 
 Bytes = bytes | bytearray
 # The header of plain CDR in little-endian order, that of all platforms of ROS 2; its last two bytes

@@ -119,7 +119,7 @@ def _find_moments(
     held: tuple[int, Array] | None = None
     acted_ns = 0
     for role, message in merge_messages(messages):
-        playback.take(role, message)
+        playback.take(role, message.receive_ns, message.content)
         if role == CMD_VEL:
             row = read_robot_command(message.content, model.robot)
             held = message.receive_ns, row

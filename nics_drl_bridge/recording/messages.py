@@ -38,6 +38,10 @@ HEADER = "std_msgs/msg/Header"
 WHEELS = ("left_wheel", "right_wheel")
 
 
+# x, y and heading in the 6 x 6 covariance of a message
+PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+
+
 def check_libraries(path: Path, what: str, instead: str = "") -> None:
     """Raises RecordingError if a library for bags is missing; `what` is `reading` or `writing`."""
     for library in LIBRARIES:
@@ -167,6 +171,12 @@ def read_pose(message: Any) -> Row:
         2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z)
     )
     return position.x, position.y, heading
+
+
+def read_pose_covariance(message: Any) -> Array | None:
+    """Returns the covariance (3, 3) of x, y, heading of a pose; None if its message has none."""
+    covariance = getattr(message.pose, "covariance", None)
+    return None if covariance is None else np.reshape(covariance, (6, 6))[PLANAR]
 
 
 def read_twist(message: Any) -> Row:

@@ -302,22 +302,14 @@ def wall_gap(
 @kernel
 def wall_distance2(x: float, y: float, wall: Array) -> float:
     """Square of the distance from a point to a straight wall (4,) [m^2]."""
-    return edge_distance2(x, y, Edge(wall[0], wall[1], wall[2], wall[3]))
+    return find_wall(x, y, wall)[2]
 
 
 @kernel
 def find_wall(x: float, y: float, wall: Array) -> tuple[float, float, float]:
     """Return the vector to the nearest point of a straight wall, and its length squared."""
-    ex = wall[2] - wall[0]
-    ey = wall[3] - wall[1]
-    length2 = ex * ex + ey * ey
-    share = 0.0
-    if length2 > 0.0:
-        share = ((x - wall[0]) * ex + (y - wall[1]) * ey) / length2
-        share = min(max(share, 0.0), 1.0)
-    dx = wall[0] + share * ex - x
-    dy = wall[1] + share * ey - y
-    return dx, dy, dx * dx + dy * dy
+    dx, dy = from_edge(x, y, Edge(wall[0], wall[1], wall[2], wall[3]))
+    return -dx, -dy, dx * dx + dy * dy
 
 
 @kernel
@@ -325,10 +317,8 @@ def wall_distance(x: float, y: float, walls: Array) -> float:
     """Distance from a point to the nearest straight wall (W, 4) [m]; inf if there is none."""
     least = np.inf
     for w in range(len(walls)):
-        wall = walls[w]
-        dx, dy = from_edge(x, y, Edge(wall[0], wall[1], wall[2], wall[3]))
-        least = min(least, np.hypot(dx, dy))
-    return least
+        least = min(least, wall_distance2(x, y, walls[w]))
+    return math.sqrt(least)
 
 
 @kernel

@@ -12,7 +12,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.arrays import Array, Integers, Singles
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import measure_clearance
+from nics_drl_bridge.sim.world import World, check_inside
 
 
 @dataclass(frozen=True)
@@ -25,14 +25,8 @@ class Sensed:
     state: Array  # (S,) true state
     ranges: Singles  # (B,) scan
     pose: Array  # (3,) true pose in `map`
-    before: Array  # (3,) true pose one step earlier
-    period: float  # length of a step [s]
+    true_twist: Array  # (3,) mean true body twist over the last step
     readings: Mapping[str, Singles]  # name -> (S,) of each further sensor
-
-    @property
-    def true_twist(self) -> Array:
-        """(3,) mean true body twist over the last step."""
-        return geometry.log(geometry.between(self.before, self.pose)) / self.period
 
 
 class DeviceWorld:
@@ -66,21 +60,19 @@ class DeviceWorld:
     def begin(self, seed: int, starts: Array | None) -> None:
         """Begin the episode of a seed, at `starts` (3 M,) x, y, heading if given."""
         robots = self._given
-        if starts is not None and starts.size != 3 * robots:
-            raise ConfigError(
-                f"episode_start has {starts.size} numbers; {robots} robots need "
-                f"{3 * robots}: x, y, heading of each."
-            )
-        placed = None if starts is None else starts.reshape(1, robots, 3)
+        placed = None
+        if starts is not None:
+            if starts.size != 3 * robots or not np.isfinite(starts).all():
+                raise ConfigError(
+                    f"episode_start is {starts.tolist()}; give x, y, heading of each robot: "
+                    f"{3 * robots} finite numbers."
+                )
+            placed = starts.reshape(1, robots, 3)
 
         def arranged(scenes: Scenes) -> Array | None:
             world = self.simulator.world.members[int(scenes.member[0])]
             for x, y, _ in [] if placed is None else placed[0].tolist():
-                if measure_clearance(world, x, y) < 0.0:
-                    raise ConfigError(
-                        f"episode_start: ({x:g}, {y:g}) m lies outside the world "
-                        f"{world.name!r}; move it inside."
-                    )
+                check_inside("episode_start", world, x, y)
             return self.arrange(scenes, placed)
 
         self.simulator.reset([seed], starts=arranged)
@@ -90,19 +82,24 @@ class DeviceWorld:
 
     def exchange(self, simulator: FastSimulator, kept: Integers) -> None:
         """Continue in another simulator, whose first robots are `kept` here."""
-
-        def moved(old: Array, new: Array) -> Array:
-            new[: len(kept)] = old[kept]
-            return new
-
         robots = simulator.data.pose.shape[1]
+        commands = np.zeros((robots, self.commands.shape[1]))
+        commands[: len(kept)] = self.commands[kept]
+        covariance = np.tile(self._added, (robots, 1, 1))
+        covariance[: len(kept)] = self._covariance[kept]
         self.simulator = simulator
-        self.commands = moved(self.commands, np.zeros((robots, self.commands.shape[1])))
-        self._covariance = moved(self._covariance, np.tile(self._added, (robots, 1, 1)))
+        self.commands = commands
+        self._covariance = covariance
         self._before = simulator.data.pose[0].copy()
 
-    def put(self, robot: int) -> None:
-        """Record that a robot was placed elsewhere, which is not motion."""
+    @property
+    def world(self) -> World:
+        """World of the present episode."""
+        return self.simulator.world.members[int(self.simulator.data.member[0])]
+
+    def put(self, robot: int, pose: Array, state: Array) -> None:
+        """Put a robot at a pose (3,) in a state (S,), which is not motion."""
+        self.simulator.put_robot(robot, pose, state)
         self._before[robot] = self.simulator.data.pose[0, robot]
 
     def advance(self) -> None:
@@ -117,6 +114,7 @@ class DeviceWorld:
     def sensed(self, robot: int) -> Sensed:
         """Return the current values of one robot; the next step may overwrite them."""
         data = self.simulator.data
+        moved = geometry.between(self._before[robot], data.pose[0, robot])
         readings = {
             name: values[0, robot] for name, values in self.simulator.readings.items()
         }
@@ -127,8 +125,7 @@ class DeviceWorld:
             data.state[0, robot],
             data.ranges[0, robot],
             data.pose[0, robot],
-            self._before[robot],
-            self._period,
+            geometry.log(moved) / self._period,
             readings,
         )
 

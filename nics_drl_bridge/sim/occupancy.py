@@ -23,7 +23,7 @@ import numpy as np
 import scipy  # its parts load slowly, when used
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.geometry import compose, rotate
+from nics_drl_bridge.geometry import compose, compute_depths, rotate
 from nics_drl_bridge.lidar.arrays import Array, Mask
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.maps import FREE, OCCUPIED, GridMap
@@ -175,21 +175,10 @@ def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
 
 
 def _inside(shape: Shape, points: Array) -> Mask:
-    """Return True (...) for points (..., 2) inside a shape, by the even-odd rule."""
+    """Return True (rows, columns) for points (rows, columns, 2) inside a shape."""
     if isinstance(shape, Circle):
         return np.hypot(points[..., 0], points[..., 1]) <= shape.radius
-    within = np.zeros(points.shape[:-1], np.bool_)
-    corners = shape.outline
-    if len(corners) < 3:  # a segment has no inside
-        return within
-    x = points[..., 0]
-    y = points[..., 1]
-    next_corners = np.roll(corners, -1, axis=0)
-    for (x1, y1), (x2, y2) in zip(corners, next_corners, strict=True):
-        if y1 == y2:
-            continue
-        # A ray from the point along x crosses an odd number of edges if the point is inside.
-        is_level = (y1 > y) != (y2 > y)
-        crossing = x1 + (y - y1) * (x2 - x1) / (y2 - y1)
-        within ^= is_level & (x < crossing)
-    return within
+    if len(shape.outline) < 3:  # a segment has no inside
+        return np.zeros(points.shape[:2], np.bool_)
+    # Row by row, because the depths of all points at once would take too much memory.
+    return np.array([compute_depths(row, shape.outline) > 0.0 for row in points])

@@ -44,7 +44,7 @@ class Scene:
     bodies: Array  # (K, 7) obstacles, see `shapes.place`; shapes are of the sampler's `shapes`
     starts: Array  # (M, 3) pose of each robot
     goals: Array  # (M, 2) position of each goal [m]
-    member: ArrayLike = 0  # index of its world in the world set
+    member: Any = 0  # index of its world in the world set
 
 
 class Scenes(Scene):
@@ -190,7 +190,6 @@ class SceneSampler:
             sampler.room = int(cells), int(count)
             sampler.scratches = self.samplers[0].scratches
         self.robots = robots
-        self._sizes = len(sizes)
         self.count = int(count) + len(world.spare)
         # spare shapes come last
         self.shapes = (*catalogue.shapes, *world.spare)
@@ -218,18 +217,8 @@ class SceneSampler:
         """
         numbers = check_seeds(seeds)
         n = len(numbers)
-        wanted = np.full(n, -1)
-        if count is not None:
-            wanted = np.maximum(np.asarray(count, np.int64), 0)
-        sizes = np.zeros(n, np.int64)
-        if size is not None:
-            sizes = np.asarray(size, np.int64)
-        if wanted.shape != (n,) or sizes.shape != (n,):
-            raise ConfigError(
-                f"count {wanted.shape} and size {sizes.shape} must be ({n},)."
-            )
-        if n and not 0 <= sizes.min() <= sizes.max() < self._sizes:
-            raise ConfigError(f"size must be from 0 to {self._sizes - 1}.")
+        wanted = np.full(n, -1) if count is None else np.maximum(count, 0)
+        sizes = np.zeros(n, np.int64) if size is None else np.asarray(size)
         draws = numbers, wanted, sizes
         scenes = Scenes(
             np.zeros((n, self.count, BODY)),

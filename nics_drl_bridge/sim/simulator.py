@@ -452,12 +452,8 @@ class FastSimulator:
         """
         mine = self.data
         theirs = source.data
-        poses = mine.pose[0].copy()
-        poses[: len(robots)] = theirs.pose[0, robots]
-        states = mine.state[0].copy()
-        states[: len(robots)] = theirs.state[0, robots]
-        for m, (pose, state) in enumerate(zip(poses, states, strict=True)):
-            self.put_robot(m, pose, state)
+        for m, robot in enumerate(robots):
+            self.put_robot(m, theirs.pose[0, robot], theirs.state[0, robot])
         for name in ROBOT_ARRAYS:
             getattr(mine, name)[0, : len(robots)] = getattr(theirs, name)[0, robots]
         for name in ("steps", "seeds", "member"):

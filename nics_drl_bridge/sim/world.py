@@ -347,6 +347,16 @@ def check_places(world: World) -> None:
                 )
 
 
+class OutsideError(ConfigError):
+    """A place lies outside the world."""
+
+
+def check_inside(what: str, world: World, x: float, y: float) -> None:
+    """Raise OutsideError for a place outside the world."""
+    if not _inside(world, x, y):
+        raise OutsideError(_describe_fault(what, world, x, y, "lies outside the world"))
+
+
 def check_place(
     what: str,
     world: World,
@@ -355,15 +365,16 @@ def check_place(
     radius: float = 0.0,
 ) -> None:
     """Raise ConfigError for a place off the field, or within a radius [m] of a wall."""
+    check_inside(what, world, x, y)
     solid = 0.0 if world.grid is None else world.grid.resolution  # in a full cell
-    room = measure_clearance(world, x, y)
-    if room <= max(radius, solid):
-        reason = "is in a wall" if room >= 0.0 else "lies outside the world"
-        x1, y1, x2, y2 = world.extent
-        raise ConfigError(
-            f"{what}: ({x:g}, {y:g}) m {reason}; the field is {x1:g} to {x2:g} "
-            f"m by {y1:g} to {y2:g} m."
-        )
+    if measure_clearance(world, x, y) <= max(radius, solid):
+        raise ConfigError(_describe_fault(what, world, x, y, "is in a wall"))
+
+
+def _describe_fault(what: str, world: World, x: float, y: float, fault: str) -> str:
+    x1, y1, x2, y2 = world.extent
+    field = f"the field is {x1:g} to {x2:g} m by {y1:g} to {y2:g} m"
+    return f"{what}: ({x:g}, {y:g}) m {fault}; {field}."
 
 
 def _inside(world: World, x: float, y: float) -> bool:

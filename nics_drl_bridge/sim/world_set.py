@@ -178,10 +178,9 @@ def _content(path: Path, keys: tuple[str, ...]) -> dict[str, Any] | None:
     if path.suffix not in YAML or not path.is_file():
         return None
     text = read_text(path)
-    if any(f"{key}:" in text for key in keys):
-        content = parse_yaml(text, str(path))
-    else:
-        content = None
+    if not any(f"{key}:" in text for key in keys):
+        return None
+    content = parse_yaml(text, str(path))
     if isinstance(content, dict) and any(key in content for key in keys):
         return content
     return None

@@ -109,7 +109,8 @@ def _read(
     for role, message in merge_messages(messages):
         if role == CMD_VEL:
             command = read_robot_command(message.content, model.robot)
-        shows = playback.take(role, message) and role == frame_role
+        used = playback.take(role, message.receive_ns, message.content)
+        shows = used and role == frame_role
         if not shows or ODOM not in middleware.cache.newest:
             continue
         stamps.append(middleware.newest_ns or 0)

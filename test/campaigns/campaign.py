@@ -60,6 +60,7 @@ class Campaign:
         controls: by their names.
         needs: modules to import; `root` for root with `ip` and `nft`, `nav2` for Nav2's sources.
         script: where it is not the campaign's name.
+        quick: whether `make test` runs the short form, too.
         attempts: of a short form that a busy machine may hold up.
         timeout_s: of one attempt.
     """
@@ -68,6 +69,7 @@ class Campaign:
     controls: Mapping[str, Control] = field(default_factory=dict)
     needs: tuple[str, ...] = ()
     script: str = ""
+    quick: bool = False
     attempts: int = 1
     timeout_s: float = 600.0
 
@@ -90,6 +92,27 @@ FAULTS = (
     "no_motion",
 )
 CAMPAIGNS: dict[str, Campaign] = {
+    "abuse_env": Campaign(
+        "--rounds 3 --seed 1",
+        {
+            "no_guard": Control(
+                "what stops the robot when an exception leaves the env",
+                "moved",
+                "--rounds 2",
+            )
+        },
+        ROS,
+    ),
+    "barn_in_dart": Campaign(
+        "--every 50 --poses 4",
+        {
+            "moved": Control(
+                "the place: this package's worlds are moved by 5 cm",
+                "beams within 1 cm",
+            )
+        },
+        ("dartpy",),
+    ),
     "damaged_input": Campaign(
         "--rounds 40 --seed 5",
         {
@@ -106,6 +129,18 @@ CAMPAIGNS: dict[str, Campaign] = {
         },
         FILES,
     ),
+    "fast_robots": Campaign(
+        "--steps 5 --robots 2000",
+        {
+            "fat": Control(
+                "the touch: the robots are measured 2 mm larger", "overlap_mm"
+            ),
+            "no_walls": Control(
+                "the walls between the rooms, for the simulator", "passed_a_wall"
+            ),
+        },
+        quick=True,
+    ),
     "gate_envelope": Campaign(
         "--steps 1200",
         {
@@ -115,6 +150,7 @@ CAMPAIGNS: dict[str, Campaign] = {
             ),
             "standing": Control("the commands: all are zero", "share_in_motion 0"),
         },
+        quick=True,
     ),
     "gate_faults": Campaign(
         "--repeats 2 " + " ".join(f"--fault {name}" for name in FAULTS),
@@ -152,6 +188,7 @@ CAMPAIGNS: dict[str, Campaign] = {
                 "--hours 0.01 --holds 4 --case 7",
             ),
         },
+        quick=True,
     ),
     "gate_load": Campaign(
         "--seconds 4",
@@ -229,6 +266,19 @@ CAMPAIGNS: dict[str, Campaign] = {
     "parity_fleet": Campaign(
         "--steps 25 --robot ackermann --robots 2 --seed 5", {}, ROS, "parity"
     ),
+    "ros_fleet": Campaign(
+        "--robots 2 --seconds 2",
+        {
+            "standing": Control("the commands: no robot drives", ": driven_m 0"),
+            "deaf": Control(
+                "the topics of one robot, which nobody receives",
+                "robot2: scan 0:",
+                "--robots 2 --seconds 2 --patience 15",
+            ),
+        },
+        ROS,
+        attempts=REAL_TIME,
+    ),
     "shield": Campaign(
         "--episodes 18",
         {
@@ -281,6 +331,7 @@ CAMPAIGNS: dict[str, Campaign] = {
                 ENV,
             ),
         },
+        quick=True,
     ),
     "standards": Campaign(
         "--parts conformance",

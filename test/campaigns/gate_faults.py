@@ -26,6 +26,7 @@ from domains import claimed_domain
 from parts.processes import keep_busy
 
 from nics_drl_bridge.nodes.gate_faults import FAULTS, LATE_S, Setup, inject_all
+from nics_drl_bridge.nodes.transport import set_transport
 
 ROBOT = "ackermann"
 TWIST = np.array([0.5, 0.0, 0.1])
@@ -102,6 +103,9 @@ def make_pool(at_once: int) -> Iterator[ProcessPoolExecutor]:
 def enter_domain(domains: Any) -> None:
     """Takes one of the domains, for all nodes that this process starts."""
     os.environ["ROS_DOMAIN_ID"] = str(domains.get())
+    set_transport(
+        os.environ
+    )  # through shared memory, a killed process may block others
 
 
 OPTIONS = {

@@ -100,7 +100,9 @@ def measure(given: Given) -> Result:
     ):
         robot = Robot(domain_id, builtin_model(ROBOT), TWIST, odom_hz=ODOM_HZ)
         try:
-            if not robot.until(lambda: robot.listeners() >= 2, PATIENCE_S):
+            if not robot.until(
+                lambda: robot.node.count_subscribers("scan") >= 2, PATIENCE_S
+            ):
                 raise RuntimeError("the gate or the bare node does not listen")
             robot.drive()
             robot.until(lambda: False, 1.0)

@@ -1,6 +1,6 @@
 """Whether a simulator generated from a drive in a physics engine predicts the robot's true motion.
 
-Each shipped robot drives at random in MuJoCo and DART, and records what its driver would
+Each shipped robot drives at random in MuJoCo, DART and PyBullet, and records what its driver would
 publish: commands, encoders, and a pose by odometry. Where wheels skid, odometry takes the turn rate
 from a gyro with noise and bias. A model is made of that drive as `nics generate` makes it. Then the
 robot drives again by other commands, by which alone the model predicts its true pose 5 s ahead.

@@ -48,10 +48,17 @@ GIVEN = {
     "record_node": ["-p", "robot:=ackermann"],
 }
 START = """
-import hashlib, sys, time
+import hashlib, signal, sys, time
 from nics_drl_bridge.nodes import own_process, start
 if sys.argv[1] == "late":
-    own_process.begin_own_process = lambda: None
+    load = start._load_main
+
+    def load_with_handlers(node):
+        for number in own_process.list_ending_signals():
+            signal.signal(number, lambda *_: sys.exit())
+        return load(node)
+
+    start._load_main = load_with_handlers
 if sys.argv[2] == "native":
     from numba.core import event
 

@@ -19,7 +19,7 @@ import numpy as np
 from campaign import Given, Result, at_least, at_most, run_campaign
 from measuring.evaluations import standing_action
 
-from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION, register_envs
+from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.nodes.processes import NodeProcess, choose_domain_id
 
 SPOILT_STEP = 3
@@ -66,7 +66,10 @@ def measure_robot(robot: str, robots: int, given: Given) -> dict[str, float]:
     world = {"model": robot, "world": given.world}
     about: dict[str, Any] = {"id": NAVIGATION} | world
     if robots > 1:
-        about |= {"id": COOPERATIVE_REACHING, "task_options": {"robots": robots}}
+        about |= {
+            "id": "NicsBridge/CooperativeReaching-v0",
+            "task_options": {"robots": robots},
+        }
     parameters = world | {"mode": "lockstep", "robots": robots}
     options = {"domain_id": domain_id, "timeout_s": 300.0}
     with ExitStack() as stack:

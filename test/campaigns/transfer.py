@@ -1,10 +1,11 @@
 """Whether one policy drives as well in physics engines that nobody here wrote.
 
 The shipped policy of each robot drives the same episodes, seed by seed, in the fast simulator and
-in MuJoCo and DART: the same worlds, starts, goals, lidar, mild randomisation, gate and
+in MuJoCo, DART and PyBullet: the same worlds, starts, goals, lidar, mild randomisation, gate and
 shield, all in process. What counts is where the robot truly ended and whether it truly touched
 something. Of two simulators, McNemar's test tells by the episodes that ended well in one of them
-alone whether they differ by more than chance.
+alone whether they differ by more than chance. PyBullet has a wheel for Python 3.11 alone:
+`pip install pybullet==3.2.7`; without it, the other engines are compared.
 
 `--out FILE` keeps the episodes of each engine ten at a time. A run that was interrupted or killed
 goes on from there by the same command, and ends with the same figures.
@@ -57,6 +58,7 @@ FAST = "fast"
 SIMULATORS = {
     "mujoco": "nics_drl_bridge.extras.mujoco.simulator",
     "dart": "nics_drl_bridge.extras.dart.simulator",
+    "pybullet": "parts.pybullet_simulator",
 }
 ENGINES = (FAST, *SIMULATORS)
 WORLDS = (

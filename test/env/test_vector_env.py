@@ -12,7 +12,7 @@ from robots import direct_model, field
 
 from nics_drl_bridge.env import vector_env
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.registry import NAVIGATION, PURSUIT_EVASION
+from nics_drl_bridge.env.registry import NAVIGATION
 from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -152,7 +152,7 @@ def test_a_mask_resets_some_worlds_only():
     ("name", "actions", "mode"),
     [
         (NAVIGATION, "continuous", MODES[0]),
-        (PURSUIT_EVASION, "discrete", MODES[1]),
+        ("NicsBridge/PursuitEvasion-v0", "discrete", MODES[1]),
     ],
 )
 def test_gymnasiums_checks_of_an_env_find_nothing_to_warn_of_in_a_vector(

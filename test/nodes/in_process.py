@@ -17,7 +17,7 @@ from typing import Any
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.nodes import runner
-from nics_drl_bridge.nodes.listener import open_context
+from nics_drl_bridge.nodes.listener import open_context, spin
 from nics_drl_bridge.nodes.qos import BridgeNode
 from nics_drl_bridge.nodes.record_node import RecordNode
 
@@ -104,12 +104,10 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
 
     def _run(self, arguments: list[str], domain_id: int) -> None:
         try:
-            made = runner.run_until_end(
-                node_class(self.node),
-                open_context(arguments, domain_id),
-                self.stopping,
-                self.node,
-            )
+            make = node_class(self.node)
+            context = open_context(arguments, domain_id)
+            with runner.open_node(make, context, self.node) as made:
+                spin(made, self.stopping)
             outcome = getattr(made, "outcome", None)  # of record_node
             self.returncode = 0
             if outcome is not None:

@@ -19,7 +19,7 @@ from nics_drl_bridge.errors import (
 )
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import NS_PER_S, Start
-from nics_drl_bridge.nodes import qos
+from nics_drl_bridge.nodes import link, qos
 from nics_drl_bridge.nodes.backends import (
     DdsBackend,
     FleetBackend,
@@ -164,7 +164,6 @@ def test_what_is_lost_on_the_way_is_requested_again_and_counts_once(
     drive(backend)
     whole = backend.step(np.array([0.5, 0.1]))
     drive(backend)
-    put = backend._inbox.put
     call = backend._episodes._repeat.call_async
     left = list(lost)
 
@@ -175,9 +174,13 @@ def test_what_is_lost_on_the_way_is_requested_again_and_counts_once(
         return False
 
     monkeypatch.setattr("nics_drl_bridge.nodes.link.LOST_S", 0.1)
-    monkeypatch.setattr(
-        backend._inbox, "put", lambda topic, m: lose(topic) or put(topic, m)
-    )
+
+    class Lossy(dict):
+        def __setitem__(self, topic, message):
+            if not lose(topic):
+                super().__setitem__(topic, message)
+
+    monkeypatch.setattr(backend._inbox, "messages", Lossy(backend._inbox.messages))
     monkeypatch.setattr(
         backend._episodes._repeat,
         "call_async",
@@ -195,9 +198,11 @@ def test_a_message_that_cant_be_read_is_told_with_its_topic(
     backend, monkeypatch, topic
 ):
     drive(backend)
-    put = backend._inbox.put
+    read = link.read_message
     monkeypatch.setattr(
-        backend._inbox, "put", lambda kind, m: put(kind, m[:14] if kind == topic else m)
+        link,
+        "read_message",
+        lambda kind, how, m: read(kind, how, m[:8] if kind == topic else m),
     )
     with pytest.raises(BackendError, match=f"topic '{topic}': a message can't be read"):
         backend.step(np.array([0.5, 0.1]))
@@ -247,7 +252,7 @@ def test_facts_of_a_fleet_are_stacked_except_the_time_that_all_share():
 def test_after_a_failed_step_a_command_asks_for_a_reset(backend, monkeypatch):
     drive(backend)
     with monkeypatch.context() as patch:
-        patch.setattr(backend._inbox, "put", lambda *_: None)
+        patch.setattr(backend._inbox, "has", lambda *_: False)
         patch.setattr(backend, "timeout_s", 0.2)
         with pytest.raises(StaleDataError):
             backend.step(np.array([0.5, 0.0]))

@@ -10,6 +10,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device, load_lidar
 from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.recording import messages
 from nics_drl_bridge.robot.spec import load_robot
 
 pytestmark = pytest.mark.ros
@@ -148,10 +149,10 @@ def test_a_planar_covariance_survives_the_way_through_a_message():
     message = PoseWithCovarianceStamped()
     message.pose.covariance = conversions.covariance_to_ros(planar)
     message.pose.pose = conversions.pose_to_ros([1.5, -2.0, -3.0], 0, "map").pose
-    pose, covariance = conversions.pose_from_ros(over_the_wire(message))
-    assert pose == pytest.approx([1.5, -2.0, -3.0])
-    assert covariance == pytest.approx(planar)
-    assert conversions.pose_from_ros(PoseStamped())[1] is None
+    arrived = over_the_wire(message)
+    assert messages.read_whole_pose(arrived) == pytest.approx([1.5, -2.0, -3.0])
+    assert messages.read_pose_covariance(arrived) == pytest.approx(planar)
+    assert messages.read_pose_covariance(PoseStamped()) is None
     whole = np.reshape(message.pose.covariance, (6, 6))
     assert (np.linalg.eigvalsh(whole) > 0.0).all()
     assert whole[2, 2] == whole[3, 3] == whole[4, 4] == conversions.UNUSED_VARIANCE
@@ -161,4 +162,4 @@ def test_an_orientation_that_was_never_filled_in_is_no_heading():
     odometry, pose = Odometry(), PoseStamped()
     odometry.pose.pose.orientation.w = pose.pose.orientation.w = 0.0
     assert np.isnan(conversions.odometry_from_ros(odometry)[0]).all()
-    assert np.isnan(conversions.pose_from_ros(pose)[0]).all()
+    assert np.isnan(messages.read_whole_pose(pose)).all()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
 import signal
 import time
@@ -19,7 +18,7 @@ from gate.assurance.samples import PROTOCOL
 
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.gate.limits import load_limits
-from nics_drl_bridge.nodes import command_ear, gate_faults
+from nics_drl_bridge.nodes import conversions, gate_faults
 from nics_drl_bridge.nodes.faulty_robot import Robot
 from nics_drl_bridge.nodes.gate_faults import (
     CONTROLS,
@@ -168,26 +167,12 @@ def test_the_controls_are_faults_that_are_injected():
     assert set(CONTROLS) <= FAULTS.keys()
 
 
-def test_the_base_ends_with_the_process_that_started_it(monkeypatch):
-    base = Mock()
-    base.spin.side_effect = [None, None]  # not more often
-    parent = Mock()
-    parent.is_alive.side_effect = [True, True, False]
-    monkeypatch.setattr(multiprocessing, "parent_process", lambda: parent)
-    monkeypatch.setattr(command_ear, "SpunNode", lambda *_: base)
-    command_ear.hear(None, Mock())
-    for call in base.spin.call_args_list:
-        assert call.kwargs["timeout_s"] <= 1.0
-
-
 def test_a_command_that_a_frozen_gate_had_written_before_does_not_count(monkeypatch):
     """The middleware may send it when the gate goes on."""
-    ear, base = multiprocessing.Pipe(duplex=False)
     robot = Robot.__new__(Robot)
     robot.repair()
     robot.heard = []
-    robot._ear = ear
-    robot.spin = Mock()
+    robot.until = Mock()
     clock = SimpleNamespace(time_ns=lambda: 500)
     monkeypatch.setattr(gate_faults, "time", clock)
     monkeypatch.setattr(gate_faults, "FROZEN_S", 0.0)
@@ -197,7 +182,7 @@ def test_a_command_that_a_frozen_gate_had_written_before_does_not_count(monkeypa
         SimpleNamespace(robot=robot, processes={"command_gate": Mock()})
     )
     assert told == [signal.SIGSTOP, signal.SIGCONT]
-    base.send((1.0, np.array([0.5, 0.0, 0.0]), 499))
-    base.send((1.1, np.zeros(3), 501))
-    assert robot.until(lambda: robot.heard, 1.0)
-    assert [when for when, _ in robot.heard] == [1.1]
+    robot._hear(conversions.twist_to_ros([0.5, 0.0, 0.0]), {"source_timestamp": 499})
+    robot._hear(conversions.twist_to_ros(np.zeros(3)), {"source_timestamp": 501})
+    ((_, twist),) = robot.heard
+    assert not twist.any()

@@ -10,10 +10,9 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model, save_model
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.middleware.measurement import Health, Rejection, TopicHealth
 from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.nodes.middleware_node import MiddlewareNode, judge_topics
-from nics_drl_bridge.nodes.runner import ERROR, OK, STALE
+from nics_drl_bridge.nodes.middleware_node import MiddlewareNode
+from nics_drl_bridge.nodes.runner import OK, STALE
 from nics_drl_bridge.robot.kinds import textbook
 from nodes.peer import odometry, pose_of, scan, stamp_ns
 
@@ -63,7 +62,7 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(direct, model):
     robot = direct("model:=ackermann", kind=MiddlewareNode)
     estimates = robot.sent["odometry/filtered"]
     first = robot.diagnose()
-    assert (first.level, first.message) == (STALE, "nothing on scan, odom yet")
+    assert (first.level, first.message) == (STALE, "nothing usable on scan, odom")
     assert first.hardware == "ackermann"
     robot.give("odom", stand(math.nan, 10))  # must not become the origin of the map
     robot.give("odom", stand(1.0, 20))
@@ -104,7 +103,7 @@ def test_pose_and_gyro_correct_the_estimate_and_are_in_the_diagnostics(direct):
     robot = direct(*given, kind=MiddlewareNode)
     estimates = robot.sent["odometry/filtered"]
     robot.give("odom", stand(1.0, 10))
-    assert robot.diagnose().message == "nothing on scan, pose, imu yet"
+    assert robot.diagnose().message == "nothing usable on scan, pose, imu"
     assert estimates[-1].pose.covariance[0] == pytest.approx(1e4)  # anywhere in the map
     pose = PoseWithCovarianceStamped()
     pose.pose.pose = conversions.pose_to_ros([30.0, -20.0, 2.0], 0, "").pose
@@ -131,33 +130,6 @@ def test_the_usual_topics_of_a_gyro_are_heard_if_the_model_was_made_with_one(
     node.configure()
     heard = {subscription.topic_name for subscription in node.subscriptions}
     assert ({"/imu", "/imu/data"} <= heard) == gyro
-
-
-def test_topics_whose_data_are_refused_are_told_apart_from_silent_ones():
-    counts = {
-        Rejection("scan", "duplicate"): 1,
-        Rejection("scan", "shape (7,), not (720,)"): 40,
-        Rejection("scans", "other"): 9,
-    }
-    expected = ("scan", "odom")
-    heard = TopicHealth(1, 10.0, 0.1)
-    told = "scan: 41 refused, the last: shape (7,), not (720,)"
-    first = Health({}, counts)
-    assert judge_topics(first, expected, {}) == (ERROR, f"nothing on odom yet; {told}")
-    assert judge_topics(first, expected, counts) == (STALE, "nothing on scan, odom yet")
-    before = counts | {Rejection("scan", "shape (7,), not (720,)"): 30}
-    assert judge_topics(Health({"odom": heard}, counts), expected, before) == (
-        ERROR,
-        told,
-    )
-    stale = {"scan": replace(heard, age_s=6.0), "odom": heard}
-    assert judge_topics(Health(stale, counts), expected, before) == (ERROR, told)
-    assert judge_topics(Health(stale, counts), expected, counts) == (
-        STALE,
-        "nothing on scan for 5 s",
-    )
-    well = Health(dict.fromkeys(expected, heard), counts)
-    assert judge_topics(well, expected, before) == (OK, "")
 
 
 def test_a_pose_type_that_does_not_exist_is_refused_with_the_nearest(make_node):

@@ -39,6 +39,7 @@ def operator(clock, monkeypatch):
 
         made = Operator.__new__(Operator)
         made._node = None
+        made._spun = SimpleNamespace(close=lambda: None)
         monkeypatch.setattr(made, "_wait_for", lambda *_: GATE)
         monkeypatch.setattr(module, "Call", Call)
         return made

@@ -13,7 +13,7 @@ from std_srvs.srv import SetBool
 from nics_drl_bridge.env.registry import NAVIGATION
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError
 from nics_drl_bridge.interface import Start
-from nics_drl_bridge.middleware.middleware import Datum
+from nics_drl_bridge.middleware.middleware import Datum, TopicCache
 from nics_drl_bridge.nodes import qos, realtime_backend
 from nics_drl_bridge.nodes.link import EpisodeServices
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
@@ -256,12 +256,13 @@ def test_the_topic_that_is_missing_is_named_not_one_that_is_silent_longer():
     now_ns = time.monotonic_ns()
     odom = Datum(stamp_ns=10**9, arrival_ns=now_ns - 10**9, sequence=0, value=None)
     arrivals = {"odom": [odom.arrival_ns], "scan": [now_ns]}
-    cache = SimpleNamespace(newest={"odom": odom}, arrivals=arrivals)
+    cache = TopicCache(newest={"odom": odom}, arrivals=arrivals)
     backend = RealtimeBackend.__new__(RealtimeBackend)
     backend._options = SimpleNamespace(stale_after_s=0.05)
     backend._topics = SimpleNamespace(
         lock=threading.RLock(),
         expected=("odom", "scan"),
+        newest_ns=odom.stamp_ns,
         middleware=SimpleNamespace(cache=cache),
     )
     with pytest.raises(StaleDataError, match="the last is") as caught:

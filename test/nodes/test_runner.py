@@ -11,7 +11,7 @@ from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes import runner
 from nics_drl_bridge.nodes.backends import DdsBackend
-from nics_drl_bridge.nodes.listener import open_context
+from nics_drl_bridge.nodes.listener import open_context, spin
 from nics_drl_bridge.nodes.middleware_node import MiddlewareNode
 from nics_drl_bridge.nodes.parameters import Row
 from nics_drl_bridge.nodes.policy_node import PolicyNode
@@ -118,8 +118,11 @@ def test_a_node_whose_callback_raises_is_stopped_before_its_context_ends(domain_
             stopped.append(self.context.ok())
 
     context = open_context([], domain_id)
-    with pytest.raises(BackendError, match="of the policy"):
-        runner.run_until_end(Failing, context, threading.Event())
+    with (
+        pytest.raises(BackendError, match="of the policy"),
+        runner.open_node(Failing, context) as node,
+    ):
+        spin(node, threading.Event())
     assert stopped == [True]
     assert not context.ok()
 
@@ -131,8 +134,11 @@ def test_a_node_is_the_only_one_of_its_name_in_its_namespace_until_it_ends(domai
 
     told = f"a node '/one/gate' already runs in ROS domain {domain_id}; end it"
     with runner.claim_name(open_in("one"), "gate"):
-        with pytest.raises(BackendError, match=told):
-            runner.run_until_end(None, open_in("one"), threading.Event(), "gate")
+        with (
+            pytest.raises(BackendError, match=told),
+            runner.open_node(None, open_in("one"), "gate"),
+        ):
+            pass
         with runner.claim_name(open_in("two"), "gate"):
             pass
     with runner.claim_name(open_in("one"), "gate"):
@@ -207,7 +213,7 @@ def test_a_middleware_publishes_its_estimate_only_while_active_and_its_state_alw
     assert robot.diagnose().message == "unconfigured"
     assert not robot.call("~/reset").success
     assert node.trigger_configure() == SUCCESS
-    assert robot.diagnose().message == "nothing on scan, odom yet"
+    assert robot.diagnose().message == "nothing usable on scan, odom"
     hear()
     assert estimates == []
     assert node.trigger_activate() == SUCCESS

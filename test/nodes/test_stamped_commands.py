@@ -7,7 +7,7 @@ import pytest
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 
-from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.backends import DdsBackend
@@ -93,14 +93,3 @@ def test_without_anybody_who_listens_it_is_the_distributions_type(domain_id):
     assert link.stamped is is_stamped_default()
     link.begin()
     link.close()
-
-
-def test_an_env_whose_chosen_type_nobody_hears_names_who_hears_the_other(
-    meet, domain_id, model
-):
-    meet(domain_id).listen(Twist, "cmd_vel", qos.COMMAND)
-    sentence = r"/cmd_vel: /peer_\d+ expects geometry_msgs/msg/Twist there.*set `stamped` to False"
-    with pytest.raises(BackendError, match=sentence):
-        DdsBackend(
-            model, load_world("empty"), domain_id=domain_id, stamped=True, timeout_s=3.0
-        )

@@ -4,7 +4,7 @@ import sys
 import pytest
 
 from nics_drl_bridge.nodes.parameters import describe_node, list_nodes
-from nics_drl_bridge.nodes.start import find_fault, format_help
+from nics_drl_bridge.nodes.start import format_help
 
 # As where no ROS 2 is installed: what is imported in vain is missed.
 WITHOUT = """
@@ -53,32 +53,6 @@ def test_defaults_are_written_as_they_are_given():
     assert "\n    goal = [.nan, .nan]: " in format_help("policy_node")
     assert "\n    limits = '': " in format_help("command_gate")
     assert "\n    autostart = true: " in format_help("middleware_node")
-
-
-@pytest.mark.process
-def test_a_parameter_without_ros_args_is_one_sentence():
-    done = run("policy_node", "policy:=mppi")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"{find_fault('policy_node', ['policy:=mppi'])}\n"
-    assert "`policy_node --ros-args -p policy:=mppi`" in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("words", "wrong"),
-    [
-        ([], ""),
-        (["--ros-args", "-p", "rate:=2.0"], ""),
-        (["--ros-args", "-p", "rate:=2.0", "--", "--verbose"], "'--verbose'"),
-        (["--rate", "2"], "'--rate'"),
-        (["-v", "--ros-args", "-r", "__ns:=/car"], "'-v'"),
-    ],
-)
-def test_the_first_word_that_is_not_for_ros_is_named(words, wrong):
-    sentence = find_fault("policy_node", words)
-    assert sentence.startswith(
-        f"policy_node: there is no argument {wrong};" if wrong else ""
-    )
-    assert bool(sentence) == bool(wrong)
 
 
 @pytest.mark.process

@@ -10,6 +10,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.nodes import conversions, wire
+from nics_drl_bridge.recording import messages
 
 pytestmark = pytest.mark.ros
 
@@ -57,7 +58,7 @@ def test_an_odometry_is_written_so_that_rclpy_reads_it_and_nothing_else_has_chan
     message.header.stamp = conversions.stamp_to_ros(STAMP_NS)
     message.pose.pose.position.x, message.pose.pose.position.y = POSE[:2].tolist()
     message.pose.pose.orientation = conversions.heading_to_ros(float(POSE[2]))
-    message.pose.covariance.reshape(6, 6)[conversions.PLANAR] = COVARIANCE
+    message.pose.covariance.reshape(6, 6)[messages.PLANAR] = COVARIANCE
     velocity = message.twist.twist
     velocity.linear.x, velocity.linear.y, velocity.angular.z = TWIST.tolist()
     assert deserialize_message(content, Odometry) == message

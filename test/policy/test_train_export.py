@@ -118,7 +118,7 @@ def test_what_is_no_policy_cannot_be_exported(tmp_path):
     with pytest.raises(ConfigError, match=r"ends with .\.onnx"):
         export_policy(network(78, 3), task, model, tmp_path / "one.zip")
     path = tmp_path / "one.onnx"
-    with pytest.raises(ValueError, match="not JSON"):
+    with pytest.raises(ConfigError, match=r"'provenance'.*finite numbers"):
         export_policy(network(78, 3), task, model, path, None, {"success": np.nan})
 
 

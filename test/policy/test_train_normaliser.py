@@ -19,7 +19,7 @@ def test_it_bends_what_lies_between_0_and_1_and_cuts_what_is_far_off():
 
 def test_the_layer_of_torch_does_the_same():
     torch = pytest.importorskip("torch", reason="needs the extra sb3")
-    from nics_drl_bridge.policy.train.torch_parts import NormaliserLayer
+    from nics_drl_bridge.extras.sb3.layers import NormaliserLayer
 
     layer = NormaliserLayer(SPACE, *SCALE)
     theirs = layer(torch.as_tensor(SEEN)).numpy()

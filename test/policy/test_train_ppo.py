@@ -19,7 +19,7 @@ from stable_baselines3 import PPO  # noqa: E402
 from stable_baselines3.common.callbacks import ConvertCallback  # noqa: E402
 from stable_baselines3.common.logger import Logger  # noqa: E402
 
-from nics_drl_bridge.policy.train.torch_parts import NormaliserLayer  # noqa: E402
+from nics_drl_bridge.extras.sb3.layers import NormaliserLayer  # noqa: E402
 from nics_drl_bridge.policy.train.vec_env import TrainVecEnv  # noqa: E402
 
 # fewer steps in an episode than in a rollout
@@ -62,7 +62,7 @@ def pair(actions="continuous", log_std=-0.5, clip=0.2, entropy=0.01):
     }
     theirs = PPO(
         "MlpPolicy",
-        TrainVecEnv.of(envs[1]),
+        TrainVecEnv(worlds=envs[1]),
         n_steps=STEPS,
         batch_size=batch,
         n_epochs=1,

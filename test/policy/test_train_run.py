@@ -58,7 +58,7 @@ def settings(tmp_path):
 def no_torch(monkeypatch):
     """PyTorch and Stable-Baselines3 are not installed."""
     for name in [*sys.modules]:
-        if name.endswith((".policy.train.sb3", ".policy.train.vec_env")):
+        if name.endswith((".extras.sb3.training", ".policy.train.vec_env")):
             monkeypatch.delitem(sys.modules, name)
     for name in ("torch", "stable_baselines3"):
         monkeypatch.setitem(sys.modules, name, None)

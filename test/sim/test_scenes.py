@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 from lidar_scenes import solid_of
-from robots import FOOTPRINT, RADIUS, circles, field
+from robots import FOOTPRINT, circles, field
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.exact_kernels import RADIUS as BODY_RADIUS
@@ -225,11 +225,3 @@ def test_a_world_that_is_too_full_is_refused_with_what_to_change():
         ConfigError, match="key 'goal_distance': no free places for 9 start"
     ):
         sample_scene(field(2.0), FOOTPRINT, 0, robots=9)
-
-
-def test_a_choice_that_does_not_fit_the_seeds_is_refused():
-    sampler = SceneSampler(field(count=1), RADIUS)
-    with pytest.raises(ConfigError, match="must be"):
-        sampler.draw([0, 1], count=[1])
-    with pytest.raises(ConfigError, match="size must be from 0 to 0"):
-        sampler.draw([0], size=[1])

@@ -9,12 +9,30 @@ import numpy as np
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import measure_path, wrap_angle
 from nics_drl_bridge.interface import Array
-from nics_drl_bridge.nodes.path_checks import GoalCheck, ProgressCheck
 
 SPACING = 0.05  # distance between the sampled points of a path [m]
 WINDOW = 2.0  # path length ahead that is searched for the nearest point [m]
 FARTHEST = 1e6  # maximum coordinate of a path [m]
 LONGEST = 1e5  # maximum length of a path [m]
+
+
+class GoalCheck(NamedTuple):
+    """When a path counts as followed; cf. Nav2's SimpleGoalChecker and PositionGoalChecker."""
+
+    xy_goal_tolerance: float  # [m]
+    # tolerance of the heading [rad]; ignored for robots that steer
+    yaw_goal_tolerance: float
+    # True: a position once reached counts as reached while the robot turns
+    stateful: bool
+    path_length_tolerance: float  # maximum remaining path length [m]
+
+
+class ProgressCheck(NamedTuple):
+    """When a robot counts as stuck; cf. Nav2's SimpleProgressChecker and PoseProgressChecker."""
+
+    required_movement_radius: float  # distance that the robot must move [m]
+    movement_time_allowance: float  # time within which it must do so [s]
+    required_movement_angle: float  # turn that also counts as progress [rad]
 
 
 class Place(NamedTuple):

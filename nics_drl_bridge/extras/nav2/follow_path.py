@@ -175,10 +175,10 @@ class PathActions:
             name: conversions.find_message_type(kind) for name, kind in KINDS.items()
         }
         if None in self._kinds.values():
-            why = (
-                "the package nav2_msgs is not installed, so its actions are not served"
+            node.get_logger().info(
+                "the package nav2_msgs is not installed, so its actions are not served; "
+                "install it with your ROS 2 distribution."
             )
-            node.get_logger().info(f"{why}; install it with your ROS 2 distribution.")
             return
         self._serve(FOLLOW, self._follow)
         if node.get_parameter(NAVIGATE).value:
@@ -282,13 +282,10 @@ class PathActions:
         asked = goal.handle.request
         names = []
         for kind, names_of_kind in self.parameters.names.items():
-            name, wrong = choose_plugin(
-                kind.replace("_", " "), getattr(asked, f"{kind}_id", ""), names_of_kind
-            )
-            if wrong:  # the code of Nav2's own server
-                code = "INVALID_CONTROLLER" if kind == "controller" else "UNKNOWN"
-                raise Refusal(code, f"{FOLLOW}: {wrong}")
-            names.append(name)
+            code = "INVALID_CONTROLLER" if kind == "controller" else "UNKNOWN"
+            with refuse_config_errors(goal, code):
+                name = getattr(asked, f"{kind}_id", "")
+                names.append(choose_plugin(kind, name, names_of_kind))
         poses = np.array([read_pose(pose) for pose in asked.path.poses]).reshape(-1, 3)
         headers = [asked.path.header, *(pose.header for pose in asked.path.poses[:1])]
         frame = next((header.frame_id for header in headers if header.frame_id), "")
@@ -297,9 +294,11 @@ class PathActions:
     def _navigate(self, goal: Goal) -> Run:
         asked = goal.handle.request
         if asked.behavior_tree:
-            fix = "leave it empty, or let Nav2 serve the action"
-            reason = f"behaviour trees such as {asked.behavior_tree!r} are not supported; {fix}."
-            raise Refusal("FAILED_TO_LOAD_BEHAVIOR_TREE", f"{NAVIGATE}: {reason}")
+            raise Refusal(
+                "FAILED_TO_LOAD_BEHAVIOR_TREE",
+                f"{NAVIGATE}: behaviour trees such as {asked.behavior_tree!r} are not "
+                "supported; leave it empty, or let Nav2 serve the action.",
+            )
         end = np.array([read_pose(asked.pose)])
         with refuse_config_errors(goal, "TF_ERROR"):
             frame, end = self._frames.fixed(asked.pose.header.frame_id, end)
@@ -320,46 +319,26 @@ class PathActions:
     def _robot_in(self, name: str, frame: str) -> Array:
         robot = self._frames.locate_robot(frame)
         if robot is None:
-            fix = "send the goal again once odometry and pose have arrived"
             raise Refusal(
-                "TF_ERROR", f"{name}: the robot's pose is not known yet; {fix}."
+                "TF_ERROR",
+                f"{name}: the robot's pose is not known yet; send the goal again once odometry "
+                "and pose have arrived.",
             )
         return robot
 
     def _begin(
         self, goal: Goal, frame: str, poses: Array, checks: Sequence[str]
     ) -> Run:
-        with refuse_config_errors(goal, goal.code):
-            PlannedPath(poses)  # before its frame is looked at
         with refuse_config_errors(goal, "TF_ERROR"):
             frame, poses = self._frames.fixed(frame, poses)
-        path = PlannedPath(poses)
+        with refuse_config_errors(goal, goal.code):
+            path = PlannedPath(poses)
         self._robot_in(goal.name, frame)
-        self._require_on_map(goal, frame, poses)
         arrival, progress = self.parameters.checks(*checks)
-        list_checker_rows = (
-            GoalChecker(arrival, not self._robot.steers),
-            ProgressChecker(progress),
-        )
+        goal_checker = GoalChecker(arrival, not self._robot.steers)
+        progress_checker = ProgressChecker(progress)
         now_s = time.monotonic()
-        return Run(goal, frame, path, *list_checker_rows, now_s, now_s)
-
-    def _require_on_map(self, goal: Goal, frame: str, poses: Array) -> None:
-        if self._map is None:
-            return
-        wanted, grid = self._map
-        here = self._frames.locate_robot(frame)
-        there = self._frames.locate_robot(wanted)
-        if here is None or there is None:
-            return
-        points = geometry.compose(there, geometry.between(here, poses))[:, :2]
-        cells = grid.world_to_cell(points)
-        off = ((cells < 0) | (cells >= grid.cells.shape)).any(axis=-1)
-        if off.any():
-            k = int(np.argmax(off))
-            x, y = points[k].round(2) + 0.0  # no negative zero
-            why = f"pose {k} of the path, ({x:.2f}, {y:.2f}) m, is off the map; replan it."
-            raise Refusal(goal.code, f"{goal.name}: {why}")
+        return Run(goal, frame, path, goal_checker, progress_checker, now_s, now_s)
 
     # The robot drives to a goal.
 

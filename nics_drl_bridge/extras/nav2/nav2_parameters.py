@@ -2,15 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
 from itertools import chain
 from typing import Any
 
 from rclpy.node import Node
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.nav2.follow import GoalCheck, ProgressCheck
 from nics_drl_bridge.nodes.parameters import list_checker_rows
-from nics_drl_bridge.nodes.path_checks import GoalCheck, ProgressCheck
 from nics_drl_bridge.nodes.runner import declare_row, declare_rows, get_text
 
 # Parameters for Nav2's own plugins, or for a control loop; a policy answers scans instead.
@@ -48,10 +47,9 @@ class ControllerParameters:
         checker = values["progress_checker_plugin"]
         if checker:
             self.names["progress_checker"] = (checker,)
-        for row in list_checker_rows(
-            self.names["goal_checker"], self.names["progress_checker"]
-        ):
-            declare_row(node, row)
+        for group in ("goal_checker", "progress_checker"):
+            for row in list_checker_rows(group, self.names[group]):
+                declare_row(node, row)
 
     def checks(self, goal: str, progress: str) -> tuple[GoalCheck, ProgressCheck]:
         """Return the checks of two names; they act like Nav2's checkers of the chosen plugins."""
@@ -59,30 +57,26 @@ class ControllerParameters:
         gets_on = self._filled(ProgressCheck, progress)
         kinds = [get_text(self._node, f"{name}.plugin") for name in (goal, progress)]
         if kinds[0].endswith(("PositionGoalChecker", "AxisGoalChecker")):
-            arrives = replace(arrives, yaw_goal_tolerance=math.inf)
+            arrives = arrives._replace(yaw_goal_tolerance=math.inf)
         if not kinds[1].endswith("PoseProgressChecker"):
-            gets_on = replace(gets_on, required_movement_angle=math.inf)
+            gets_on = gets_on._replace(required_movement_angle=math.inf)
         return arrives, gets_on
 
     def _filled(self, kind: Any, name: str) -> Any:
-        values = {
-            field.name: self._node.get_parameter(f"{name}.{field.name}").value
-            for field in fields(kind)
-        }
-        return kind(**values)
+        names = [f"{name}.{field}" for field in kind._fields]
+        return kind(*(self._node.get_parameter(field).value for field in names))
 
     def ignores(self, name: str) -> bool:
         """True for a parameter of Nav2's own controller that means nothing to a policy."""
         return name in UNUSED or name.split(".")[0] in chain(*self.names.values())
 
 
-def choose_plugin(what: str, asked: str, known: Sequence[str]) -> tuple[str, str]:
-    """Return a plugin's name and what is wrong with it; an empty name selects the only plugin."""
-    if not asked and len(known) == 1:
-        return known[0], ""
-    if asked in known:
-        return asked, ""
-    return (
-        "",
-        f"there is no {what} {asked!r}; name one of {', '.join(map(repr, known))}.",
-    )
+def choose_plugin(kind: str, name: str, known: Sequence[str]) -> str:
+    """Return a plugin's name; an empty one selects the only plugin. Raises ConfigError."""
+    if not name and len(known) == 1:
+        return known[0]
+    if name not in known:
+        what = kind.replace("_", " ")
+        names = ", ".join(map(repr, known))
+        raise ConfigError(f"there is no {what} {name!r}; name one of {names}.")
+    return name

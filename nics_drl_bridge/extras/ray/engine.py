@@ -31,6 +31,7 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.extras.ray.networks import TorchActor, make_layers
+from nics_drl_bridge.extras.sb3.layers import to_tensors
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.policy.train import run as train
@@ -42,7 +43,6 @@ from nics_drl_bridge.policy.train.settings import (
     TrainingSettings,
     check_serves,
 )
-from nics_drl_bridge.policy.train.torch_parts import to_tensors
 from nics_drl_bridge.policy.train.worlds import COLLISION as TOLD_COLLISION
 from nics_drl_bridge.policy.train.worlds import SUCCESS as TOLD_SUCCESS
 from nics_drl_bridge.policy.train.worlds import TrainingWorlds

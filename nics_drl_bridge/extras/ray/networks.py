@@ -10,10 +10,10 @@ import gymnasium
 import numpy as np
 import torch
 
+from nics_drl_bridge.extras.sb3.layers import NormaliserLayer
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.arrays import AnyArray, Singles
 from nics_drl_bridge.policy.train.networks import ACTION_GAIN, HIDDEN_GAIN
-from nics_drl_bridge.policy.train.torch_parts import NormaliserLayer
 
 
 class TorchActor(torch.nn.Module):

@@ -16,8 +16,10 @@ def open_services(node: Any) -> "Server | None":
     if not runner.get_flag(node, "simulation_interfaces"):
         return None
     if conversions.find_message_type(NEWEST) is None:
-        missing = "the package simulation_interfaces, 2.1 or newer, is not installed"
-        node.get_logger().info(f"{missing}, so that its services are not offered")
+        node.get_logger().info(
+            "the package simulation_interfaces, 2.1 or newer, is not installed, so that its "
+            "services are not offered"
+        )
         return None
     from nics_drl_bridge.extras.simulation_interfaces.server import Server
 

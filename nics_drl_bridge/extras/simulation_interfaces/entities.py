@@ -1,11 +1,9 @@
 """Entities: their names and states, and how they are spawned, moved and deleted."""
 
-import math
 import re
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Accel
 from simulation_interfaces.msg import EntityFilters, EntityState, Result, SpawnResult
 from simulation_interfaces.srv import SetEntityState
 
@@ -21,7 +19,6 @@ from nics_drl_bridge.extras.simulation_interfaces.models import (
 from nics_drl_bridge.extras.simulation_interfaces.roster import (
     NAME,
     Entity,
-    OutsideError,
 )
 from nics_drl_bridge.extras.simulation_interfaces.state import (
     Host,
@@ -32,7 +29,8 @@ from nics_drl_bridge.extras.simulation_interfaces.state import (
 )
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import conversions, device_parameters
-from nics_drl_bridge.recording.messages import is_rotation
+from nics_drl_bridge.recording.messages import read_whole_pose
+from nics_drl_bridge.sim.world import OutsideError
 
 FAILED = Result.RESULT_OPERATION_FAILED
 INVALID_POSE = SetEntityState.Response.INVALID_POSE
@@ -40,11 +38,6 @@ FORMATS = ["sdf", "yaml"]
 SUFFIXES = (".sdf", ".yaml", ".yml")
 SHIPPED = "entities"  # folder of the shipped ones, in config/
 MOST_BYTES = 2**24  # of a file
-# A search takes time in the power of the repetitions, and exponential time where one is repeated.
-MOST_REPETITIONS = 3
-REPETITION = re.compile(r"(?<!\\)[*+{]")
-REPEATED = re.compile(r"(?<!\\)\)[*+{]")
-LEAN = 0.02  # maximum angle of what stands upright [rad]
 # With room for the names of topics, which may have 255 characters in all.
 NAMESPACE = re.compile(
     r"(?=.{1,120}\Z)/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"
@@ -74,9 +67,6 @@ class EntityServices:
         if filters != EntityFilters(filter=text):
             fault = "entities are filtered by name alone; leave out all else."
             raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, fault)
-        if len(REPETITION.findall(text)) > MOST_REPETITIONS or REPEATED.search(text):
-            fix = f"repeat no group, and use at most {MOST_REPETITIONS} repetitions"
-            raise RefusalError(FAILED, f"the filter {text!r} may take hours; {fix}.")
         try:
             pattern = re.compile(text)
         except re.error as error:
@@ -111,7 +101,7 @@ class EntityServices:
         base = self._find_frame(asked.header.frame_id, INVALID_POSE)
         pose = twist = None
         if request.set_pose:
-            pose = pose_from_ros(asked.pose, base, INVALID_POSE)
+            pose = pose_from_ros(asked, base, INVALID_POSE)
         if request.set_twist:
             linear = asked.twist.linear
             twist = np.array([linear.x, linear.y, asked.twist.angular.z])
@@ -119,10 +109,6 @@ class EntityServices:
                 fault = "the twist holds NaN or inf; give finite numbers."
                 raise RefusalError(FAILED, fault)
             twist[:2] = geometry.rotate(twist[:2], base[2])
-        still = entity.robot < 0 and entity.motion is None
-        if still and request.set_acceleration and asked.acceleration != Accel():
-            fault = f"{entity.name!r} stands still and takes no acceleration"
-            raise RefusalError(FAILED, f"{fault}; leave it out.")
         try:
             entities.move(entity, pose, twist)
         except OutsideError as error:
@@ -139,8 +125,11 @@ class EntityServices:
         name = names.get(frame, frame)
         entity = next((entity for entity in entities if entity.name == name), None)
         if entity is None:
-            fix = "leave it empty for the world, or name an entity"
-            raise RefusalError(code, f"the frame {frame!r} is not known here; {fix}.")
+            raise RefusalError(
+                code,
+                f"the frame {frame!r} is not known here; leave it empty for the world, or name "
+                "an entity.",
+            )
         return entities.pose(entity)
 
     def delete(self, request: Any, _: Any) -> None:
@@ -154,14 +143,13 @@ class EntityServices:
         name = self._choose_name(request, "" if model is None else model.name)
         space = request.entity_namespace
         if space and not NAMESPACE.fullmatch(space):
-            fault = f"entity_namespace {space!r} is no namespace of ROS"
             raise RefusalError(
-                SpawnResult.NAMESPACE_INVALID, f"{fault}; write it as in 'robot_1'."
+                SpawnResult.NAMESPACE_INVALID,
+                f"entity_namespace {space!r} is no namespace of ROS; write it as in 'robot_1'.",
             )
         code = SpawnResult.INVALID_POSE
-        posed = request.initial_pose
-        base = self._find_frame(posed.header.frame_id, code)
-        pose = pose_from_ros(posed.pose, base, code)
+        base = self._find_frame(request.initial_pose.header.frame_id, code)
+        pose = pose_from_ros(request.initial_pose, base, code)
         try:
             if model is None:
                 self._spawn_robot(name, space or re.sub(r"\W", "_", name), pose)
@@ -234,34 +222,28 @@ class EntityServices:
         if not wanted and request.allow_renaming:
             wanted = "entity"
         if not NAME.fullmatch(wanted):
-            fault = f"the name {wanted!r} is not valid; use up to 120 letters, digits, and _ . / -"
-            raise RefusalError(SpawnResult.NAME_INVALID, f"{fault} between them.")
+            raise RefusalError(
+                SpawnResult.NAME_INVALID,
+                f"the name {wanted!r} is not valid; use up to 120 letters, digits, and _ . / - "
+                "between them.",
+            )
         free = self._simulation.entities.find_free_name(wanted)
         if free != wanted and not request.allow_renaming:
-            fix = "give another, or set allow_renaming"
             raise RefusalError(
-                SpawnResult.NAME_NOT_UNIQUE, f"the name {wanted!r} is taken; {fix}."
+                SpawnResult.NAME_NOT_UNIQUE,
+                f"the name {wanted!r} is taken; give another, or set allow_renaming.",
             )
         return free
 
 
-def pose_from_ros(pose: Any, base: Array, code: int) -> Array:
+def pose_from_ros(message: Any, base: Array, code: int) -> Array:
     """Return x, y, heading (3,) in `map` of a pose in a frame that has a pose (3,) there.
 
-    Raises RefusalError with a code for what is no pose in the plane; z is not looked at.
+    Raises RefusalError with a code for an invalid pose; only x, y and heading are looked at.
     """
-    place = pose.position
-    turn = pose.orientation
-    quaternion = turn.x, turn.y, turn.z, turn.w
-    fault = ""
-    if not all(map(math.isfinite, (place.x, place.y, place.z, *quaternion))):
-        fault = "holds NaN or inf; give finite numbers"
-    elif not is_rotation(*quaternion):
-        fault = f"has the quaternion {quaternion}; give one of unit length"
-    elif 1.0 - 2.0 * (turn.x**2 + turn.y**2) < math.cos(LEAN):
-        fault = "leans, but the world is flat; turn about z alone"
-    if fault:
-        raise RefusalError(code, f"the pose {fault}.")
-    local = np.array([place.x, place.y, conversions.compute_heading(*quaternion)])
+    local = np.array(read_whole_pose(message))
+    if not np.isfinite(local).all():
+        fault = "the pose needs finite numbers and a quaternion of unit length."
+        raise RefusalError(code, fault)
     pose_in_map: Array = geometry.compose(base, local)
     return pose_in_map

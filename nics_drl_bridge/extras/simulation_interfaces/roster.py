@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,26 +16,17 @@ from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.sdf import Placed
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import FASTEST, Motion
+from nics_drl_bridge.sim.world import FASTEST, Motion, check_inside
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 OBSTACLE = "obstacle_"  # prefix of the name of a world's obstacle, before its number
 NAME = re.compile(r"(?=.{1,120}\Z)[A-Za-z0-9_][A-Za-z0-9_./-]*")
-REACH = 10.0  # limit of a twist set on a robot, as a multiple of its maximum command
 
 
 class UnknownEntityError(BridgeError):
     """No entity has that name."""
 
     code = 2  # RESULT_NOT_FOUND of the standard
-
-
-class StillError(BridgeError):
-    """A twist was requested for an entity that stands still."""
-
-
-class OutsideError(BridgeError):
-    """A pose lies outside the world."""
 
 
 @dataclass(eq=False)
@@ -52,28 +43,33 @@ class Entity:
     motion: Motion | None = None
 
 
-@dataclass
 class Entities:
     """All entities of a device's world; even those of the world itself may be removed.
 
     When robots come or go, or shapes come for which the simulator has no space, `make` makes a new
-    simulator, in which the episode continues.
+    simulator, in which the episode continues. `robots` are the names of the robots that the
+    simulator started with.
     """
 
-    device: DeviceWorld
-    world: AnyWorld
-    robots: tuple[str, ...]  # names of the robots that the simulator started with
-    make: Callable[[AnyWorld, int], FastSimulator]
-    removed: set[int] = field(default_factory=set)  # slots of the world's own obstacles
-    spawned: dict[str, Entity] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self._own = self.device.simulator.sampler.count
-        self._launched = list(self.robots)
+    def __init__(
+        self,
+        device: DeviceWorld,
+        world: AnyWorld,
+        robots: tuple[str, ...],
+        make: Callable[[AnyWorld, int], FastSimulator],
+    ) -> None:
+        self.device = device
+        self.world = world
+        self.robots = robots
+        self.make = make
+        self.removed: set[int] = set()  # slots of the world's own obstacles
+        self.spawned: dict[str, Entity] = {}
+        self._own = device.simulator.sampler.count
+        self._launched = list(robots)
         self._spare = list[Shape]()
         # the bodies, in the order of slots
         self._table: Array = np.zeros((self._own, 7))
-        self.device.arrange = self._arrange
+        device.arrange = self._arrange
 
     @property
     def simulator(self) -> FastSimulator:
@@ -152,30 +148,20 @@ class Entities:
         moving: Array = self.simulator.data.velocity[0, entity.slots[0]].copy()
         return moving
 
-    def require_inside(self, pose: Array) -> None:
-        """Raise OutsideError for a pose (3,) outside the world."""
-        x1, y1, x2, y2 = self.world.members[int(self.simulator.data.member[0])].extent
-        if not (x1 <= pose[0] <= x2 and y1 <= pose[1] <= y2):
-            held = f"x {x1:g} to {x2:g} m, y {y1:g} to {y2:g} m"
-            place = f"x {pose[0]:g} m, y {pose[1]:g} m is outside the world"
-            raise OutsideError(f"{place}, which spans {held}; move it.")
-
     def move(self, entity: Entity, pose: Array | None, twist: Array | None) -> None:
         """Put an entity at a pose (3,), or give it a twist (3,) along the axes of `map`.
 
-        Raises StillError for a twist of an entity at rest, ConfigError for one beyond a robot's
-        reach, OutsideError for a pose outside.
+        A twist is limited to what the entity can do. Raises ConfigError for a twist of an entity
+        that never moves, OutsideError for a pose outside.
         """
-        if (
-            twist is not None
-            and twist.any()
-            and entity.robot < 0
-            and entity.motion is None
-        ):
-            fix = "set only its pose, or a zero twist"
-            raise StillError(f"{entity.name!r} stands still and takes no twist; {fix}.")
+        still = entity.robot < 0 and entity.motion is None
+        if still and twist is not None and twist.any():
+            raise ConfigError(
+                f"{entity.name!r} stands still and takes no twist; set only its pose, or a "
+                "zero twist."
+            )
         if pose is not None:
-            self.require_inside(pose)
+            check_inside("the pose", self.device.world, pose[0], pose[1])
         if entity.robot >= 0:
             self._move_robot(entity.robot, pose, twist)
             return
@@ -195,17 +181,9 @@ class Entities:
             ahead, aside = geometry.rotate(twist[:2], -at[2])
             spec = simulator.model.robot
             command = spec.from_cmd_vel([ahead, aside, twist[2]])
-            if (
-                np.abs(command)
-                > REACH * np.maximum(-spec.command_low, spec.command_high)
-            ).any():
-                raise ConfigError(
-                    f"the twist is more than {REACH:g} times what {spec.name!r} can be "
-                    "commanded; give a smaller one."
-                )
-            state = textbook(spec).target(command)
-        simulator.put_robot(robot, np.array(at), np.array(state))
-        self.device.put(robot)
+            limited = np.clip(command, spec.command_low, spec.command_high)
+            state = textbook(spec).target(limited)
+        self.device.put(robot, np.array(at), np.array(state))
 
     def _show(self, bodies: Array) -> None:
         self._table = bodies
@@ -228,7 +206,7 @@ class Entities:
 
         Raises OutsideError, and ConfigError for shapes that the simulator can't hold.
         """
-        self.require_inside(pose)
+        check_inside("the pose", self.device.world, pose[0], pose[1])
         used = {slot for entity in self.spawned.values() for slot in entity.slots}
         spare = list(self._spare)
         slots = list[int]()
@@ -256,7 +234,7 @@ class Entities:
 
     def spawn_robot(self, name: str, pose: Array) -> Entity:
         """Add a robot of the simulator's kind at a pose (3,). Raises OutsideError, ConfigError."""
-        self.require_inside(pose)
+        check_inside("the pose", self.device.world, pose[0], pose[1])
         count = len(self.robot_names)
         entity = Entity(name, robot=count, start=np.array(pose))
         self._remake(self._spare, list(range(count)), count + 1)

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable
 from typing import Any, NoReturn
 
+from simulation_interfaces import srv
 from simulation_interfaces.msg import Result, SimulatorFeatures
 
 from nics_drl_bridge.extras.simulation_interfaces.entities import (
@@ -16,7 +17,6 @@ from nics_drl_bridge.extras.simulation_interfaces.state import (
     Simulation,
     served,
 )
-from nics_drl_bridge.nodes import conversions
 
 FEATURES = (
     "SPAWNING",
@@ -82,16 +82,12 @@ class Server:
         self._offer("GetSimulatorFeatures", self._tell)
 
     def _offer(self, name: str, reply: Callable[[Any, Any], Any]) -> None:
-        kind = conversions.find_message_type(f"simulation_interfaces/srv/{name}")
-        if kind is not None:  # in an older version of the standard there are fewer
-            self._host.create_service(kind, snake_case(name), reply)
+        self._host.create_service(getattr(srv, name), snake_case(name), reply)
 
     @staticmethod
     def _tell(_: Any, response: Any) -> Any:
         features: SimulatorFeatures = response.features
-        features.features = [
-            getattr(features, name) for name in FEATURES if hasattr(features, name)
-        ]
+        features.features = [getattr(features, name) for name in FEATURES]
         features.spawn_formats = FORMATS
         features.custom_info = ABOUT
         return response

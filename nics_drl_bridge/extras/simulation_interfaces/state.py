@@ -195,8 +195,10 @@ class Simulation:
         if not scope & EVERY_SCOPE or (
             scope & ~EVERY_SCOPE and scope != SCOPES.SCOPE_ALL
         ):
-            bits = "1 (time), 2 (state) and 4 (spawned)"
-            fault = f"scope {scope} has bits that mean nothing; add up {bits}, or give 0 for all."
+            fault = (
+                f"scope {scope} has bits that mean nothing; add up 1 (time), 2 (state) and 4 "
+                "(spawned), or give 0 for all."
+            )
             raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, fault)
         if scope & EVERY_SCOPE == EVERY_SCOPE:
             self._reset_all()

@@ -114,6 +114,6 @@ class PolicyDriver:
 
     def act(self, truth: Truth) -> Array:
         """Returns the command (C,)."""
-        view = RobotView(truth.pose, truth.twist, truth.ranges, 0.0, 0.0, 0.0)
+        view = RobotView(truth.pose, truth.twist, truth.ranges)
         observation = self._task.observation(view, {"goal": truth.goal})
         return np.asarray(self._task.command(self._policy.act(observation)), np.float64)

@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import json
+import math
 import reprlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -128,11 +129,10 @@ class Contract(Schema):
     @field_validator("provenance")
     @classmethod
     def _check_plain(cls, provenance: dict[str, Any]) -> dict[str, Any]:
-        if any(
-            not isinstance(v, str | int | float | bool | None)
-            for v in provenance.values()
-        ):
-            raise ValueError("must contain only text and numbers")
+        for value in provenance.values():
+            is_plain = isinstance(value, str | int | float | bool | None)
+            if not is_plain or (isinstance(value, float) and not math.isfinite(value)):
+                raise ValueError("must contain only text and finite numbers")
         return provenance
 
 
@@ -155,13 +155,15 @@ def make_contract(
     observation = describe_observation(task)
     data: dict[str, Any] = {
         "format": FORMAT,
-        "robot": task.robot.model_dump(mode="json"),
-        "lidar": task.lidar.model_dump(mode="json"),
-        "scan": None if task.scan is None else task.scan.model_dump(mode="json"),
+        "robot": task.robot,
+        "lidar": task.lidar,
+        "scan": task.scan,
+        "sensors": task.sensors,
         "task": {**entry, "sha256": _hash_task(entry, observation)},
         "observation": observation,
         "actions": task.actions,
         "control_period": model.control_period,
+        "max_episode_steps": max_episode_steps,
         "model_fingerprint": model.fingerprint,
         "provenance": dict(provenance),
         "graph_sha256": graph_sha256,
@@ -170,17 +172,13 @@ def make_contract(
             for name, rows in golden.items()
         },
     }
-    if task.sensors:
-        data["sensors"] = [sensor.model_dump(mode="json") for sensor in task.sensors]
     if state is not None:
         gap = GAP_PERIODS * model.control_period
         data["state"] = {"size": state[0], "start": state[1], "longest_gap": gap}
     if foreign is not None:
         data |= {"batch": 1, "foreign": dict(foreign)}
-    if max_episode_steps is not None:
-        data["max_episode_steps"] = max_episode_steps
-    validate(data, Contract, "policy")
-    return json.dumps(data, allow_nan=False)
+    contract = validate(data, Contract, "policy")
+    return contract.model_dump_json(exclude={"checksums"})
 
 
 def draw_golden_observations(task: Task) -> Rows:

@@ -101,11 +101,9 @@ class PolicyFile:
     @cached_property
     def task_options(self) -> dict[str, Any]:
         """Arguments of the policy's task: its options, scan and sensors."""
-        scan = self.contract.scan
-        options = {
-            **self.contract.task.options,
-            **({} if scan is None else {"scan": scan}),
-        }
+        options = dict(self.contract.task.options)
+        if self.contract.scan is not None:
+            options["scan"] = self.contract.scan
         if self.contract.sensors:
             options["sensors"] = self.contract.sensors
         return options

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -46,9 +46,10 @@ def export_policy(
 ) -> policy_file.PolicyFile:
     """Exports a trained model as a policy file, and loads it as a robot does.
 
-    The model is the `Actor` of a training here, or anything that `torch_export.find_actor` takes;
-    the latter may have a normaliser: mean (O,), deviation (O,) and limit. Raises ConfigError if the
-    model can't be exported, PolicyError if the file does not reproduce its outputs.
+    The model is the `Actor` of a training here, or a PPO, A2C or SAC of Stable-Baselines3, or a
+    torch module, see `extras.sb3.export.find_actor`; these may have a normaliser: mean (O,),
+    deviation (O,) and limit. Raises ConfigError if the model can't be exported, PolicyError if the
+    file does not reproduce its outputs.
     """
     file = Path(path)
     if file.suffix != SUFFIX:
@@ -88,10 +89,9 @@ def _make_raw_network(
                 "the actor of a training has a normaliser of its own; leave `normaliser` out."
             )
         return network_graph.make_raw_network(model)
-    with extensions.require_modules("the export of a network of PyTorch"):
-        from nics_drl_bridge.policy.train import torch_export
+    adapter = extensions.load("adapters", "torch")
     inputs = task.observation_space.shape[0]
-    return torch_export.make_raw_network(model, inputs, normaliser)
+    return cast(RawNetwork, adapter.make_raw_network(model, inputs, normaliser))
 
 
 def _make_golden(network: RawNetwork, task: Task, source: str) -> dict[str, Rows]:

@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.lidar.arrays import AnyArray, Singles
+from nics_drl_bridge.policy.train.kernels import LOG_NORM
 from nics_drl_bridge.policy.train.normaliser import Normaliser
 
 # gains of the initial weights, as in Stable-Baselines3
 HIDDEN_GAIN = 2.0**0.5
 ACTION_GAIN = 0.01  # of an actor's last layer: all actions start near zero
 VALUE_GAIN = 1.0  # of a critic's last layer
-LOG_NORM = 0.5 * np.log(2.0 * np.pi)  # constant term of a normal log density
 
 
 class Layer(NamedTuple):
@@ -139,7 +139,7 @@ class ActorCritic:
             chosen: Singles = shifted[np.arange(len(raw)), actions] - log_sums
             return chosen
         deviations = (actions - raw) * np.exp(-self.log_std)
-        constant = (self.log_std + np.float32(LOG_NORM)).sum()
+        constant = (self.log_std + LOG_NORM).sum()
         densities: Singles = -0.5 * np.square(deviations).sum(axis=1) - constant
         return densities
 

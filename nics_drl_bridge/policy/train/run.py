@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import filelock
 import gymnasium
@@ -167,9 +167,7 @@ class Training(Protocol):
 def _find_engine(settings: TrainingSettings) -> Callable[..., Training]:
     if settings.lean:
         return LeanPpo
-    with extensions.require_modules("Stable-Baselines3's engine"):
-        from nics_drl_bridge.policy.train.sb3 import Sb3Training
-    return Sb3Training
+    return cast(Callable[..., Training], extensions.load("trainings", "sb3"))
 
 
 def refuse_diverged(training: Training, bound: float = math.inf) -> None:
@@ -206,15 +204,9 @@ def _restore(
             part.restore(content["state"])
         for env, arrays in zip(training_worlds.envs, content["envs"], strict=True):
             checkpoints.restore(env, arrays)
-    except (
-        AttributeError,
-        IndexError,
-        OverflowError,
-        KeyError,
-        RuntimeError,
-        TypeError,
-        ValueError,
-    ) as error:
+    except ConfigError:
+        raise
+    except Exception as error:  # noqa: BLE001 - damaged content breaks libraries in any way
         raise ConfigError(
             f"{path}: is not the checkpoint of a training "
             f"({shorten(str(error), 120)}); train again."

@@ -19,20 +19,15 @@ with extensions.require_modules("TrainVecEnv"):
 
 
 class TrainVecEnv(VecEnv):
-    """Adapts `BridgeVectorEnv`s (`SameStep`, `copy=True`) to SB3. Raises ConfigError for others."""
+    """Adapts `BridgeVectorEnv`s (`SameStep`, `copy=True`), or the `worlds` of a training, to SB3.
 
-    def __init__(self, *envs: BridgeVectorEnv) -> None:
-        self._adapt(TrainingWorlds(*envs))
+    Raises ConfigError for other vector envs.
+    """
 
-    @classmethod
-    def of(cls, worlds: TrainingWorlds) -> TrainVecEnv:
-        """Adapts the worlds of a training."""
-        env = cls.__new__(cls)
-        env._adapt(worlds)
-        return env
-
-    def _adapt(self, worlds: TrainingWorlds) -> None:
-        self.worlds = worlds
+    def __init__(
+        self, *envs: BridgeVectorEnv, worlds: TrainingWorlds | None = None
+    ) -> None:
+        self.worlds = worlds = worlds or TrainingWorlds(*envs)
         self.envs = worlds.envs
         super().__init__(worlds.num_envs, worlds.observation_space, worlds.action_space)
         self._infos: list[dict[str, Any]] = [{} for _ in range(worlds.num_envs)]

@@ -7,12 +7,15 @@ import pytest
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.extras.nav2.follow import (
+    GoalCheck,
     GoalChecker,
     PlannedPath,
+    ProgressCheck,
     ProgressChecker,
 )
-from nics_drl_bridge.nodes.path_checks import GoalCheck, ProgressCheck
 
+GOAL = GoalCheck(0.25, 0.25, stateful=True, path_length_tolerance=1.0)
+PROGRESS = ProgressCheck(0.5, 10.0, required_movement_angle=math.inf)
 CORNER = np.array([(0.0, 0.0, 0.0), (2.0, 0.0, math.pi / 2), (2.0, 2.0, math.pi)])
 
 
@@ -76,7 +79,7 @@ def arrive(checker, *poses):
 
 
 def test_at_the_goal_a_robot_turns_and_then_is_there():
-    check = GoalCheck()
+    check = GOAL
     assert arrive(GoalChecker(check, turns=True), (2.0, 1.5, 1.0)) is None
     left = arrive(GoalChecker(check, turns=True), (2.0, 1.9, 1.0))
     assert left == pytest.approx(
@@ -88,8 +91,10 @@ def test_at_the_goal_a_robot_turns_and_then_is_there():
 
 def test_a_place_that_was_reached_stays_so_if_the_check_is_stateful():
     drifted = (2.0, 1.9, 1.0), (2.0, 1.6, 1.0)
-    assert arrive(GoalChecker(GoalCheck(), turns=True), *drifted) is not None
-    assert arrive(GoalChecker(GoalCheck(stateful=False), turns=True), *drifted) is None
+    assert arrive(GoalChecker(GOAL, turns=True), *drifted) is not None
+    assert (
+        arrive(GoalChecker(GOAL._replace(stateful=False), turns=True), *drifted) is None
+    )
 
 
 def test_a_loop_does_not_end_where_it_begins():
@@ -97,7 +102,7 @@ def test_a_loop_does_not_end_where_it_begins():
         [(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (2.0, 2.0, 0.0), (0.0, 0.1, 0.0)]
     )
     path = PlannedPath(loop)
-    checker = GoalChecker(GoalCheck(), turns=False)
+    checker = GoalChecker(GOAL, turns=False)
     assert (
         checker.turn_left(path.locate(np.zeros(3), 1.0), np.zeros(3), path.end) is None
     )
@@ -106,13 +111,13 @@ def test_a_loop_does_not_end_where_it_begins():
 def test_a_turn_is_progress_where_it_is_to_count():
     turned = np.array([0.0, 0.0, 0.6])
     for angle, stuck in ((math.inf, True), (0.5, False)):
-        checker = ProgressChecker(ProgressCheck(required_movement_angle=angle))
+        checker = ProgressChecker(PROGRESS._replace(required_movement_angle=angle))
         assert not checker.stuck(0.0, np.zeros(3))
         assert checker.stuck(10.5, turned) is stuck
 
 
 def test_a_robot_that_does_not_get_on_is_stuck():
-    checker = ProgressChecker(ProgressCheck())
+    checker = ProgressChecker(PROGRESS)
     assert not checker.stuck(0.0, np.zeros(3))
     assert not checker.stuck(9.0, np.array([0.4, 0.0, 0.0]))
     assert checker.stuck(10.5, np.array([0.4, 0.0, 0.0]))

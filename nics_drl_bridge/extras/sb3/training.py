@@ -13,11 +13,11 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 
+from nics_drl_bridge.extras.sb3.layers import NormaliserLayer, to_tensors
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.arrays import AnyArray, Singles
 from nics_drl_bridge.policy.train.progress import RECENT, TrainingLog, Watch
 from nics_drl_bridge.policy.train.settings import LEAST_RATE, TrainingSettings
-from nics_drl_bridge.policy.train.torch_parts import NormaliserLayer, to_tensors
 from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 from nics_drl_bridge.policy.train.worlds import COLLISION, TrainingWorlds
 
@@ -54,7 +54,7 @@ class Sb3Training:
         statistics: tuple[Array, Array],
     ) -> None:
         torch.set_num_threads(settings.threads)
-        env = TrainVecEnv.of(worlds)
+        env = TrainVecEnv(worlds=worlds)
         self._total = settings.steps
         self._log_every = LOG_EVERY[settings.algorithm]
         shared: dict[str, Any] = {

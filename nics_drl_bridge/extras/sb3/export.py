@@ -21,7 +21,7 @@ from nics_drl_bridge.policy.train.network_graph import (
 )
 
 
-class Standardised(torch.nn.Module):  # type: ignore[misc]
+class Standardised(torch.nn.Module):
     """An actor behind a standardisation: mean (O,), deviation (O,) and limit, or None."""
 
     def __init__(
