@@ -29,6 +29,34 @@ def ros_module(module):
 NAN = float("nan")
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"n": 4},
+        {"unsafe_commands": 1},
+        {"p50_s": 0.31},
+        {"p50_s": NAN},
+        {"max_s": 0.41},
+        {"max_s": NAN},
+        {"max_s": math.inf},
+    ],
+)
+def test_a_fault_that_is_late_unsafe_or_not_measured_misses_one_bar(ros_module, change):
+    set_bars = ros_module("gate_faults").set_bars
+    good = {
+        "n": 5,
+        "asked": 5,
+        "p50_s": 0.2,
+        "max_s": 0.3,
+        "limit_s": 0.4,
+        "unsafe_commands": 0,
+    }
+    few = good | {"n": 1, "asked": 1, "p50_s": 0.31}  # no median, but chance
+    for figures, missed in ((good, 0), (few, 0), (good | change, 1)):
+        result = {"x": figures}
+        assert len(find_missed(result, set_bars(result))) == missed
+
+
 def test_every_rule_of_the_gate_has_a_name_by_which_it_is_taken_out(module):
     rules = module("gate_rules")
     names = rules.list_rules()
