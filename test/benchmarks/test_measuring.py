@@ -11,7 +11,6 @@ from textwrap import dedent
 import numpy as np
 import pytest
 from docs.test_pages import INDENTED, ROOT, check_options, text_of
-from PIL import Image
 
 from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.errors import ConfigError
@@ -55,26 +54,6 @@ def test_the_csv_of_a_foreign_robot_reads_as_its_recording(foreign, tmp_path, na
     assert read.command.t == pytest.approx(commands.t)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"share_of_path": 0.04},
-        {"yardstick_share": 0.01},
-        {"constant_twist_share": 0.01},
-        {"error_m": NAN},
-        {"crashed": "ValueError: x"},
-    ],
-    ids=str,
-)
-def test_a_drive_misses_a_bar_by_one_figure(change):
-    drives = import_module("measuring.drives")
-    limits = drives.Limits(share=0.03, error_m=0.03)
-    shares = {"share_of_path": 0.02, "yardstick_share": 0.03}
-    good = {**shares, "error_m": 0.02, "constant_twist_share": 0.5}
-    for told, missed in ((good, 0), (good | change, 1)):
-        assert len(find_missed(told, drives.set_bars(told, limits))) == missed
-
-
 def test_every_mapping_that_is_shown_has_its_drive():
     bars = import_module("measuring.drives")
     found = [*bars.EXAMPLES.glob("*.yaml"), *bars.SHIPPED.glob("*.yaml")]
@@ -102,6 +81,7 @@ def unseen(lesson):
     return select_windows(lesson.drive, Calibration(), 26.0, 40.0, 5.0, 0.5)
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(("name", "share"), [("sysid", 0.03), ("sindy", 0.2)])
 def test_what_others_fit_predicts_a_drive_that_it_did_not_see(
     monkeypatch, lesson, unseen, name, share
@@ -287,16 +267,6 @@ def test_a_larger_footprint_is_the_same_outline_scaled(robot):
 
 
 # The first hour
-
-
-def test_a_picture_moves_if_its_ends_differ(tmp_path):
-    moved = import_module("first_hour").moved
-    still, shifted = (Image.new("RGB", (100, 80), "white") for _ in range(2))
-    still.paste("black", (10, 10, 20, 20))
-    shifted.paste("black", (60, 30, 70, 40))
-    for last, extent in ((shifted, 60), (still.copy(), 0)):
-        still.save(tmp_path / "a.gif", save_all=True, append_images=[shifted, last])
-        assert moved(tmp_path / "a.gif") == extent
 
 
 def test_the_roads_are_those_of_the_pages(tmp_path):

@@ -11,7 +11,6 @@ from .campaign import FOLDER, ROOT
 
 sys.path.insert(0, str(FOLDER))
 mutants = import_module("mutants")
-OUTCOMES = (mutants.KILLED, mutants.TIMED_OUT, mutants.SURVIVED)
 
 SOURCE = '''"""A limit of 3, and of 4."""
 
@@ -136,17 +135,6 @@ def test_a_larger_draw_contains_the_smaller_one_and_rooms_have_equal_parts():
     assert [mutant.room for mutant in few] == ["gate"] * 5 + ["env"] * 4
 
 
-def test_the_tests_that_import_the_module_run_first(tree):
-    room = tree / "test" / "gate"
-    room.mkdir(parents=True)
-    (room / "test_a.py").write_text("limits = 1\n")
-    (room / "test_b.py").write_text("from nics_drl_bridge.gate import limits\n")
-    (room / "test_limits.py").write_text("")
-    ordered = mutants.order_tests(tree, "nics_drl_bridge/gate/limits.py", "gate")
-    names = [Path(file).name for file in ordered]
-    assert names == ["test_limits.py", "test_b.py", "test_a.py"]
-
-
 def test_the_module_itself_stays_when_its_copy_is_broken(tree):
     snapshot = tree / "snapshot"
     target = tree / "copy"
@@ -158,31 +146,6 @@ def test_the_module_itself_stays_when_its_copy_is_broken(tree):
     (target / "room" / "limits.py").write_text("LARGEST = 2\n")
     assert source.read_text() == "LARGEST = 1\n"
     assert not (target / "room" / "limits.cpython.pyc").exists()
-
-
-@pytest.mark.parametrize(
-    ("code", "outcome"),
-    [
-        (0, mutants.SURVIVED),
-        (1, mutants.KILLED),
-        (2, mutants.KILLED),
-        (-11, mutants.KILLED),
-        (None, mutants.TIMED_OUT),
-    ],
-)
-def test_the_exit_code_of_the_tests_says_what_became_of_a_mutant(code, outcome):
-    assert mutants.judge(mutants.Run(code, 1.0, [], "")) == outcome
-
-
-def test_the_summary_counts_a_time_out_as_found_and_shows_survivors(tree):
-    drawn = mutants.draw(tree, 7, ("gate",), 3)
-    records = [
-        mutant.describe(SOURCE) | {"outcome": outcome}
-        for mutant, outcome in zip(drawn, OUTCOMES, strict=True)
-    ]
-    gate, _, place, *_ = mutants.summarise(records, ["gate"]).split("\n")
-    assert gate.split()[:4] == ["gate", "2", "of", "3"]
-    assert place.startswith(f"{drawn[2].file}:{records[2]['line']} ")
 
 
 @pytest.mark.campaign

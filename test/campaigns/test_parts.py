@@ -141,16 +141,6 @@ def test_engines_are_compared_by_the_episodes_that_all_have_driven(module):
     assert all(line.startswith("engines: rover: dart: ") for line in missed)
 
 
-def test_failures_are_told_by_place_and_end_the_most_frequent_first(module):
-    transfer = module("transfer")
-    rows = [drove("fast", 0, "success"), drove("fast", 1, "time-out")]
-    rows += [drove("dart", seed, "time-out") for seed in (0, 1)]
-    first, second = transfer.find_clusters(rows)
-    assert (first["engine"], first["failures"], first["seeds"]) == ("dart", 2, [0, 1])
-    assert first["not_in_fast"] == 1
-    assert (second["engine"], second["not_in_fast"]) == ("fast", 0)
-
-
 def test_a_run_goes_on_where_the_file_ends(module, tmp_path):
     transfer = module("transfer")
     open_book = module("parts.book").Book

@@ -93,22 +93,17 @@ def bag(path: Path) -> None:
     data = env._backend.simulator.data
     rng = np.random.default_rng(2)
     topics: dict[str, list[Any]] = {}
-    nothing = np.zeros(0, np.float32)
     env.reset(seed=1)
     actions = np.repeat(rng.uniform(-0.8, 0.8, (60, 2)), 5, axis=0)
     for k, action in enumerate(actions, 1):
         t = 0.1 * k
         forward, _, turn = env.task.robot.to_cmd_vel(env.task.command(action))
-        fields = [float(value) for value in env.task.lidar.header]
-        laser = bags.header(t, "laser")
-        seen = data.ranges[0, 0].copy()
-        scan = bags.new("sensor_msgs/LaserScan", laser, *fields, seen, nothing)
         velocity = data.twist[0, 0].tolist()
         said = {
             "/odom": bags.moving_odometry(
                 t, data.odom[0, 0].tolist(), velocity, covariance=0.01
             ),
-            "/scan": scan,
+            "/scan": bags.scan_of(env.task.lidar, t, data.ranges[0, 0]),
             "/cmd_vel": bags.twist(float(forward), 0.0, float(turn)),
             "/mocap": bags.pose_stamped(t, *data.pose[0, 0].tolist()),
         }

@@ -154,6 +154,7 @@ def test_a_layout_is_given_by_name_number_or_fields():
         ({"sectors": 36}, "'range_max' is missing"),
         ({"sectors": 36, "range_max": 1.0, "beams": 3}, "unknown key 'beams'"),
         (2, "sectors"),
+        ({"sectors": 36, "range_max": 1.0, "angle_min": 9.0}, "angle"),
     ],
 )
 def test_a_wrong_layout_is_refused_with_the_fix(given, words):

@@ -56,14 +56,14 @@ ENGINES = {
 def settings(algorithm="ppo", **changes):
     data = {
         "worlds": {"one": 5, "another": 3},
-        "steps": 1600,
+        "steps": 960,
         "max_episode_steps": 40,
         "algorithm": algorithm,
         "hidden": [16],
         "checkpoint_every": 320,
         "randomisation": "mild",
         "ppo": {"rollout": 16, "batch": 64, "epochs": 2},
-        "sac": {"batch": 32, "updates": 1, "begin_after": 400, "buffer": 800},
+        "sac": {"batch": 32, "updates": 1, "begin_after": 240, "buffer": 480},
     }
     return TrainingSettings.model_validate(data | changes)
 
@@ -115,17 +115,17 @@ def test_an_interrupted_training_comes_to_the_same_weights(
     options = {"actions": actions}
     chosen = settings(task_options=options, **ENGINES[engine], **changes)
     whole = train(chosen, 1, tmp_path / "whole")
-    assert whole.steps == 1600 or 640 <= whole.steps < 16_000
+    assert whole.steps == 960 or 640 <= whole.steps < 16_000
 
     def interrupt(progress):
-        if progress.steps > 1000 or not np.isnan(progress.held_out):
+        if progress.steps > 680 or not np.isnan(progress.held_out):
             raise BrokenOffError
 
     # Told of every rollout, whatever the clock says.
     monkeypatch.setattr("nics_drl_bridge.policy.train.progress.TOLD_S", 0.0)
     with pytest.raises(BrokenOffError):
         train(chosen, 1, tmp_path / "broken", interrupt)
-    assert 0 < steps_in(tmp_path / "broken" / CHECKPOINT) < 1000
+    assert 0 < steps_in(tmp_path / "broken" / CHECKPOINT) < 680
     if engine != "lean":
         import torch
 
