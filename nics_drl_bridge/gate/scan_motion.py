@@ -211,9 +211,10 @@ def _explain_contradiction(
 
 def judge_motion(config: GateConfig, kept: tuple[View, ...], newest: View) -> Verdict:
     """Judges whether the newest scan shows the motion that odometry shows since an earlier one."""
-    reference, lesser_fraction = _select_reference(kept, newest)
-    if reference is None:
+    selected = _select_reference(kept, newest)
+    if selected is None:
         return UNDECIDED
+    reference, lesser_fraction = selected
     # Scans stamped too late show at least this fraction of a free robot's motion; see `usual_half`.
     share_scale = min(1.0, lesser_fraction / SETTINGS.usual_half)
     observed, changed = _compare_scans(config, reference, newest)
@@ -262,7 +263,7 @@ def _compare_scans(
 
 def _select_reference(
     kept: tuple[View, ...], newest: View
-) -> tuple[View | None, float]:
+) -> tuple[View, float] | None:
     """Returns the scan to compare the newest one with; None if odometry shows too little motion.
 
     Also returns the fraction of the motion in the half of the time with less motion.
@@ -279,7 +280,7 @@ def _select_reference(
         if turn <= SETTINGS.usual_turn:
             break
     if chosen is None:
-        return None, 0.0
+        return None
     reference = kept[chosen]
     middle_ns = (reference.stamp_ns + newest.stamp_ns) // 2
     middle = min(kept[chosen + 1 :], key=lambda scan: abs(scan.stamp_ns - middle_ns))
@@ -294,7 +295,7 @@ def _select_reference(
         and lesser_motion >= SETTINGS.min_half_motion
     )
     if motion < 1.0 or not (is_usual or is_enough):
-        return None, 0.0
+        return None
     return reference, lesser_motion / motion
 
 
