@@ -24,6 +24,7 @@ from nics_drl_bridge.nodes.faulty_robot import Robot
 from nics_drl_bridge.nodes.listener import holds
 from nics_drl_bridge.nodes.parameters import STAMPED
 from nics_drl_bridge.nodes.processes import NodeProcess, unused_domain_id
+from nics_drl_bridge.robot.spec import RobotSpec
 
 CORES = (1.0, 0.5, 0.25)
 RATES = (10.0, 20.0)
@@ -157,15 +158,8 @@ def _run_nodes(
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         save_model(model, folder / "model")  # a vehicle has its model in a folder, too
-        commands = {}
-        for variable in model.robot.command:
-            low = min(variable.min, 0.0)
-            high = max(variable.max, 0.0)
-            slopes = {"rate": 2.0 * (high - low), "jerk": 40.0 * (high - low)}
-            commands[variable.name] = {"min": low, "max": high, **slopes}
-        limits = folder / "limits.yaml"  # that hardly limit the robot
-        text = dump_yaml({"robot": model.robot.name, "commands": commands})
-        limits.write_text(text, encoding="utf-8")
+        limits = folder / "limits.yaml"
+        _write_limits(model.robot, limits)
         parameters: dict[str, dict[str, Any]] = {
             "middleware_node": {"imu": "none"},
             "policy_node": {"imu": "none", "policy": policy, "goal": GOAL, "rate": 0.0},
@@ -202,6 +196,18 @@ def _run_nodes(
         if not robot.until(are_running, PATIENCE_S):
             raise BackendError(f"the nodes do not run after {PATIENCE_S:g} s.")
         yield nodes, robot
+
+
+def _write_limits(robot: RobotSpec, file: Path) -> None:
+    """Write limits that hardly limit a robot."""
+    commands = {}
+    for variable in robot.command:
+        low = min(variable.min, 0.0)
+        high = max(variable.max, 0.0)
+        slopes = {"rate": 2.0 * (high - low), "jerk": 40.0 * (high - low)}
+        commands[variable.name] = {"min": low, "max": high, **slopes}
+    text = dump_yaml({"robot": robot.name, "commands": commands})
+    file.write_text(text, encoding="utf-8")
 
 
 def _measure(
