@@ -2,6 +2,7 @@
 
 import math
 import time
+import traceback
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped
 
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import BridgeError, ConfigError, shorten
 from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, RobotView
@@ -28,6 +29,7 @@ from nics_drl_bridge.policy.policies import open_policy
 
 # time between two looks at cancelled goals and silent data, as a fraction of the control period
 POLLS = 0.5
+LONGEST_REASON = 300  # maximum length of a policy's error text [characters]
 
 
 class PolicyNode(ManagedNode):
@@ -247,8 +249,21 @@ class PolicyNode(ManagedNode):
         )
 
     def _asked(self, view: RobotView, goal: Array) -> Array:
-        action = self._policy.act(self._task.observation(view, {"goal": goal}))
-        return self._task.robot.to_cmd_vel(self._task.command(action))
+        try:
+            action = self._policy.act(self._task.observation(view, {"goal": goal}))
+            return self._task.robot.to_cmd_vel(self._task.command(action))
+        except BridgeError:
+            raise
+        except Exception as error:
+            self.get_logger().debug(traceback.format_exc())
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            words = shorten(f"{type(error).__name__}: {error}", LONGEST_REASON)
+            name = self.get_parameter("policy").value
+            where = f"{place.filename}, line {place.lineno}"
+            fix = "the robot is stopped; fix the policy."
+            raise BridgeError(
+                f"policy {name!r} raised {words} ({where}); {fix}"
+            ) from error
 
     def _message(self, twist: Array, stamp_ns: int) -> TwistStamped:
         frame = runner.get_text(self, "base_frame")

@@ -1,4 +1,5 @@
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -70,6 +71,20 @@ def test_a_goal_in_the_robots_frame_lies_ahead_of_it_and_one_in_no_known_frame_i
     assert facts["newest goal taken"] == "False"
     assert "'kitchen' is refused" in facts["newest goal"]
     assert look(11, (1.0, 2.0, math.pi / 2)).twist.linear.x > 0.0
+
+
+def test_an_error_of_a_policy_is_told_with_its_place(standing, monkeypatch):
+    robot, look = standing("goal:=[2.0, 0.0]")
+
+    def fail(observation):
+        raise ZeroDivisionError("no lidar today")
+
+    monkeypatch.setattr(robot.node, "_policy", SimpleNamespace(act=fail))
+    with pytest.raises(
+        BridgeError,
+        match=r"ZeroDivisionError: no lidar today \(.*test_policy_node.py, line \d+\)",
+    ):
+        look(10)
 
 
 def test_with_a_pose_sensor_it_waits_until_it_knows_where_in_the_map_it_is(standing):
