@@ -19,7 +19,7 @@ from nics_drl_bridge.gate.evidence import (
 from nics_drl_bridge.gate.evidence_kernels import Tolerance
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.inputs import Odometry, Scan, Tick
-from nics_drl_bridge.gate.shield import CREEP_SPEED
+from nics_drl_bridge.gate.shield import CREEP_SPEED, _span_car_twists
 from nics_drl_bridge.gate.state import ShieldConfig, View, begin
 from nics_drl_bridge.interface import NS_PER_S
 
@@ -374,3 +374,16 @@ def test_among_turns_that_fit_equally_well_the_one_closest_to_odometrys_is_taken
     new = View(NS_PER_S // 10, np.array([0.0, 0.0, turn / fraction]), ranges)
     motion = estimate_motion(old, new, get_beams(GIVEN), Tolerance(0.03, 0.0))
     assert motion == pytest.approx([0.0, 0.0, turn])
+
+
+@pytest.mark.parametrize(
+    ("odometry", "speeds", "curvature"),
+    [(None, {0.5}, 0.0), ((1.0, 0.0, 0.5), {0.5, 1.0}, 0.5)],
+)
+def test_a_car_may_go_on_at_the_speed_and_curvature_of_odometry(
+    odometry, speeds, curvature
+):
+    driven = None if odometry is None else np.array(odometry)
+    twists = _span_car_twists(CAR.wheelbase, np.array([[0.5, 0.0, 0.0]]), driven)
+    assert set(twists[:, 0]) == speeds
+    assert (twists[:, 2] / twists[:, 0]).max() == pytest.approx(curvature)
