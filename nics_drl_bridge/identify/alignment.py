@@ -230,7 +230,7 @@ def choose_half_width(drive: Drive) -> float:
     pose = unwrap_headings(drive.dated.values)
     span = float(t[-1] - t[0])
     every = span / max(len(t) - 1, 1)
-    speed = np.hypot(*np.diff(pose[:, :2], axis=0).T).sum() / span
+    speed = geometry.measure_path(pose)[-1] / span
     turn = np.abs(np.diff(pose[:, 2])).sum() / span
     position, heading = drive.pose_noise or (0.0, 0.0)
     for width in WIDTHS_S:

@@ -45,7 +45,6 @@ from nics_drl_bridge.identify.forms import (
     drop_unreached_ends,
     find_input_curve,
     find_likely_delay,
-    list_driving_commands,
 )
 from nics_drl_bridge.identify.judgement import (
     estimate_bands,
@@ -246,15 +245,6 @@ class Identified:
         return self.assessment.verdict
 
     @property
-    def dead_zone(self) -> float:
-        """Maximum of the driving command at which the robot stays at rest; 0 if none."""
-        spec = self.drive.spec
-        driving = set(list_driving_commands(spec))
-        if not driving:  # no textbook says what each command moves
-            driving = {c.name for c in spec.command if not c.turns and c.unit != "rad"}
-        return _find_dead_zone(self.model, driving)
-
-    @property
     def alpha(self) -> Alpha:
         """Threshold of the pruning; `auto` for the knee of the accuracy curve."""
         return self.drive.settings.alpha
@@ -280,24 +270,6 @@ def _make_result(trial: Findings, final: Findings) -> Identified:
         findings=trial,
         notes=final.notes,
     )
-
-
-def _find_dead_zone(model: TaylorModel, driving: set[str]) -> float:
-    """Returns the largest command of those that drive at which no state starts to move.
-
-    A state with dry friction starts when the effect of its command exceeds the friction.
-    """
-    dead = {c.command: c.dead for c in model.inputs if c.command in driving}
-    zones = [0.0, *dead.values()]
-    for i, place in enumerate(model.state_size + model.drivers):
-        if model.variables[place] not in driving:
-            continue
-        alone = np.arange(len(model.variables)) == place
-        gain = abs(model.coefficients[3 + i, (model.powers == alone).all(axis=1)].sum())
-        if model.friction[i] * gain > 0.0:
-            zone = dead.get(model.variables[place], 0.0)
-            zones.append(zone + float(model.friction[i] / gain))
-    return max(zones)
 
 
 def repair_drive(drive: Drive, findings: Findings) -> Findings:

@@ -87,7 +87,7 @@ def select_windows(
     good &= episode[begin] == episode[end]
     begin = begin[good]
     end = end[good]
-    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
+    length = geometry.measure_path(pose)
     return Windows(
         t[begin], t[end], pose[begin], pose[end], length[end] - length[begin]
     )

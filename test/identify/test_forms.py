@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ from nics_drl_bridge.identify.forms import (
 )
 from nics_drl_bridge.identify.identify import (
     STAGES,
-    Identified,
     find_input_curves,
     run,
 )
@@ -190,18 +188,3 @@ def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, sample
     assert within.inputs[0].most == pytest.approx(0.8 * sent.max())
     assert within.inputs[0].least == -np.inf
     assert within.limits[0].tolist() == [-np.inf, 0.5 * asked.max()]
-
-
-def test_the_dead_zone_of_a_steering_is_none_of_the_drive():
-    spec = throttle_car()
-    inputs = (
-        InputCurve(command="throttle", dead=0.1),
-        InputCurve(command="steering", dead=0.3),
-    )
-    terms = {"d_vx": {"throttle": 9.0}, "d_wz": {"steering": 9.0}}
-    model = make_model(spec, terms, inputs=inputs)
-    found = SimpleNamespace(model=model, drive=SimpleNamespace(spec=spec))
-    assert Identified.dead_zone.fget(found) == 0.1
-    rubbing = replace(model, friction=np.array([0.9, 0.0, 9.0]))
-    found.model = rubbing
-    assert Identified.dead_zone.fget(found) == pytest.approx(0.2)
