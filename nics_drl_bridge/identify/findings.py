@@ -13,7 +13,6 @@ from nics_drl_bridge.identify.open_loop import OpenLoop
 from nics_drl_bridge.identify.terms import Kind
 from nics_drl_bridge.identify.yardstick import Yardstick
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.taylor import HorizonErrors, TaylorModel
 
@@ -45,8 +44,6 @@ class Findings:
     # half-width [s] of the parabolas by which `derive_motion` derived the state; None if the
     # state is not derived from the poses
     motion_width_s: float | None = None
-    # input curves beyond doubt, from `find_input_curves`
-    clear_curves: tuple[InputCurve, ...] = ()
     # of the training part on one time axis, from `fit_terms`
     samples: Samples | None = None
     # all terms (Eq. 1), from `fit_terms`

@@ -41,7 +41,6 @@ from nics_drl_bridge.identify.findings import (
     resample_drive,
 )
 from nics_drl_bridge.identify.forms import (
-    CLEAR,
     drop_unreached_ends,
     find_input_curve,
     find_likely_delay,
@@ -377,18 +376,14 @@ def find_input_curves(drive: Drive, findings: Findings) -> Findings:
     findings = _with_likely_latency(findings)
     samples = resample_drive(training, findings)
     curves = []
-    clear = []
     for place in range(len(drive.spec.command)):
         candidate = find_input_curve(samples, drive.spec, place)
-        if candidate is None:
-            continue
-        curves.append(candidate.curve)
-        if candidate.gain >= CLEAR:
-            clear.append(candidate.curve)
+        if candidate is not None:
+            curves.append(candidate.curve)
     if not curves:
         return findings
     calibration = replace(findings.calibration, inputs=tuple(curves))
-    findings = replace(findings, calibration=calibration, clear_curves=tuple(clear))
+    findings = replace(findings, calibration=calibration)
     return _with_likely_latency(findings)  # the curves may hide a part of it
 
 

@@ -84,7 +84,7 @@ def _fit_base(
 ) -> tuple[hypotheses.Base, tuple[hypotheses.Trial, ...]]:
     """Fits the base, and tries orders of terms beyond it; a refit reuses both choices."""
     if findings.base is None:
-        base = hypotheses.fit_base(evidence, findings.clear_curves)
+        base = hypotheses.fit_base(evidence)
     else:
         base = hypotheses.refit_base(evidence, findings.base)
     asked = hypotheses.list_hypotheses(order, evidence.library)
