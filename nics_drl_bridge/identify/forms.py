@@ -13,18 +13,19 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
-from nics_drl_bridge.identify.alignment import choose_half_width, smooth_commands
-from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.open_loop import MIDDLE_OF_STEP, roll
-from nics_drl_bridge.identify.signals import (
+from nics_drl_bridge.identify.alignment import (
     average_effect,
+    choose_half_width,
     find_speed_index,
     lag_behind,
     list_followed_commands,
     select_moved_commands,
     select_moved_inputs,
+    smooth_commands,
 )
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.open_loop import MIDDLE_OF_STEP, roll
 from nics_drl_bridge.identify.statistics import compute_unexplained
 from nics_drl_bridge.identify.terms import (
     Kind,
@@ -33,7 +34,7 @@ from nics_drl_bridge.identify.terms import (
     select_motion_terms,
     tells_lever_from_wheels,
 )
-from nics_drl_bridge.identify.yardstick import probe_structure
+from nics_drl_bridge.identify.textbook import probe_structure
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
@@ -470,7 +471,7 @@ def _list_motor_values(evidence: Evidence, form: Form) -> dict[str, Row]:
         if (response.state, response.command) in form.followed:
             size = abs(response.gain) * float(np.ptp(variables[response.command]))
             rates[response.state] = np.array([-size, size])
-    rows = {}
+    rows: dict[str, Row] = {}
     for name in form.resisted:
         rows |= _list_resistance_values(name, rates[name], variables, spec)
     for name in form.limits:

@@ -13,10 +13,9 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import forms, shooting, terms
-from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.calibration import Alpha, Calibration, Order
 from nics_drl_bridge.identify.fit import list_unmoved_variables, prune
 from nics_drl_bridge.identify.open_loop import HORIZON_S
-from nics_drl_bridge.identify.settings import Alpha, Order
 from nics_drl_bridge.identify.statistics import CERTAIN
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor

@@ -9,6 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nics_drl_bridge.identify.alignment import select_moved_commands
+from nics_drl_bridge.identify.calibration import Alpha
+from nics_drl_bridge.identify.drive import Alone, Doubt, Mistake
+from nics_drl_bridge.identify.findings import (
+    FAR_OFF,
+    describe_coarsest_state,
+    list_missed,
+)
 from nics_drl_bridge.identify.fit import describe_narrow_commands
 from nics_drl_bridge.identify.hypotheses import PRUNING, list_candidates
 from nics_drl_bridge.identify.identify import Identified
@@ -18,17 +26,7 @@ from nics_drl_bridge.identify.judgement import (
     select_usual_horizon,
 )
 from nics_drl_bridge.identify.repair import describe_reference
-from nics_drl_bridge.identify.settings import Alpha
-from nics_drl_bridge.identify.signals import select_moved_commands
 from nics_drl_bridge.identify.statistics import Curve
-from nics_drl_bridge.identify.verdict import (
-    FAR_OFF,
-    Alone,
-    Doubt,
-    Mistake,
-    describe_coarsest_state,
-    list_missed,
-)
 from nics_drl_bridge.robot.kinds import describe_overdrive
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel

@@ -9,6 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from identify.drives import make_model, slipping_car, throttle_car
+from nics_drl_bridge.identify.calibration import Settings
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.findings import Findings, resample_drive
 from nics_drl_bridge.identify.forms import (
@@ -25,7 +26,6 @@ from nics_drl_bridge.identify.identify import (
     find_input_curves,
     run,
 )
-from nics_drl_bridge.identify.settings import Settings
 from nics_drl_bridge.identify.terms import Kind, Library
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve

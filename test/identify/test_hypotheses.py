@@ -29,8 +29,13 @@ from nics_drl_bridge.identify.hypotheses import (
     list_candidates,
     list_hypotheses,
 )
-from nics_drl_bridge.identify.identify import STAGES, fit_terms, identify, run
-from nics_drl_bridge.identify.prediction_fit import make_library
+from nics_drl_bridge.identify.identify import (
+    STAGES,
+    fit_terms,
+    identify,
+    make_library,
+    run,
+)
 from nics_drl_bridge.identify.report import format_report
 from nics_drl_bridge.identify.shooting import Parameters, Shooting
 from nics_drl_bridge.identify.terms import Kind, Library
