@@ -50,7 +50,7 @@ from nics_drl_bridge.identify.open_loop import (
     predict,
     select_windows,
 )
-from nics_drl_bridge.identify.yardstick import fit_yardstick, predict_kept_twist
+from nics_drl_bridge.identify.textbook import fit_yardstick, predict_kept_twist
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.measurement import ODOM
 from nics_drl_bridge.middleware.middleware import Middleware

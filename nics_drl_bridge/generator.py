@@ -22,9 +22,9 @@ from nics_drl_bridge.config import (
     validate,
 )
 from nics_drl_bridge.errors import ConfigError, FitError, ModelError, suggest
-from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.settings import (
+from nics_drl_bridge.identify.calibration import (
     Alpha,
+    Calibration,
     Order,
     Settings,
     parse_alpha,

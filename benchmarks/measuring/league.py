@@ -22,13 +22,12 @@ from scipy.ndimage import uniform_filter1d
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.alignment import choose_half_width
+from nics_drl_bridge.identify.alignment import average_held, choose_half_width
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.drive import Drive, unwrap_headings
 from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, select_windows
 from nics_drl_bridge.identify.shooting import HEADING_ARM_M
-from nics_drl_bridge.identify.signals import average_held, unwrap_headings
-from nics_drl_bridge.identify.yardstick import (
+from nics_drl_bridge.identify.textbook import (
     HORIZONS_S,
     LOSS_SCALE,
     TextbookResponse,

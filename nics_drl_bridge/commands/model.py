@@ -318,7 +318,7 @@ def generate(
     """
     from nics_drl_bridge.generator import check_place, mount_lidar, save_model
     from nics_drl_bridge.generator import generate as generate_model
-    from nics_drl_bridge.identify.settings import parse_alpha, parse_order
+    from nics_drl_bridge.identify.calibration import parse_alpha, parse_order
     from nics_drl_bridge.lidar.sensor import load_sensor
     from nics_drl_bridge.lidar.spec import load_lidar
     from nics_drl_bridge.recording.readers import choose_mapping, open_drives

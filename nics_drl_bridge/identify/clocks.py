@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify import signals
+from nics_drl_bridge.identify import alignment
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import MIN_STAMPS, Drive, TwistIntervals
 from nics_drl_bridge.identify.statistics import (
@@ -86,9 +86,9 @@ def estimate_response_delay(
     lags: Array | None = None,
 ) -> DelayEstimate:
     """Estimates a signal's delay around centers [s], and the moved commands' lags if unknown."""
-    moved = signals.select_moved_inputs(command, spec)[: len(spec.state)]
+    moved = alignment.select_moved_inputs(command, spec)[: len(spec.state)]
     free = np.flatnonzero(moved if lags is None else [])
-    base = signals.get_nominal_lags(spec) if lags is None else lags
+    base = alignment.get_nominal_lags(spec) if lags is None else lags
     left_over = make_response_residual(command, spec, target)
 
     def residual(theta: Array) -> Array:
@@ -107,21 +107,21 @@ def estimate_response_delay(
 def make_response_residual(command: Stream, spec: RobotSpec, target: Target) -> Left:
     """Returns the residual of a signal explained by commands, given lags (S,) and a delay [s]."""
     start, end, signal = target
-    moved = signals.select_moved_inputs(command, spec)
+    moved = alignment.select_moved_inputs(command, spec)
     powers = taylor.list_exponents(len(moved), 2)
     powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
     grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
 
     def residual(lags: Array, delay: Array | float) -> Array:
         if not spec.state:
-            means = signals.average_held(
+            means = alignment.average_held(
                 command, spec, start - delay, end - delay, powers
             )
             return compute_unexplained(means, signal)
-        states = signals.infer_states(command, spec, lags, delay, grid)
+        states = alignment.infer_states(command, spec, lags, delay, grid)
         chi = taylor.evaluate(states, powers)
         return compute_unexplained(
-            signals.average_between_stamps(grid, chi, start, end), signal
+            alignment.average_between_stamps(grid, chi, start, end), signal
         )
 
     return residual
@@ -138,7 +138,7 @@ def make_state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Resi
     middle = (state.values[keep + 1] + state.values[keep]) / 2.0
 
     def residual(theta: Array) -> Array:
-        u = signals.average_held(command, spec, start - theta[0], end - theta[0])
+        u = alignment.average_held(command, spec, start - theta[0], end - theta[0])
         return compute_unexplained(
             np.concatenate([np.ones((len(u), 1)), middle, u], axis=1), rates
         )
@@ -160,7 +160,7 @@ def make_shift_residual(state: Stream, target: Target) -> Residual:
     chi = taylor.evaluate(state.values, taylor.list_exponents(state.values.shape[1], 2))
 
     def residual(theta: Array) -> Array:
-        means = signals.average_between_stamps(
+        means = alignment.average_between_stamps(
             state.t, chi, start - theta[0], end - theta[0]
         )
         return compute_unexplained(means, signal)
@@ -258,7 +258,7 @@ def measure_timing(drive: Drive) -> TimingEstimate:
         )
     if state is not None:
         return _estimate_by_measured_state(drive, state)
-    if not signals.select_moved_commands(command).any():
+    if not alignment.select_moved_commands(command).any():
         start = command.t[0] - recording.pose.t[0]
         return make_nominal_timing(drive, float(start) if abs(start) > 60.0 else 0.0)
     target = (twists.start, twists.end, twists.twist)
@@ -325,7 +325,7 @@ def _find_delay_near(left_over: Left, delay: DelayEstimate) -> float | None:
 def make_nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
     """Returns nominal lags and no latency, without any estimation."""
     if drive.recording.state is None:
-        lags = signals.get_nominal_lags(drive.spec)
+        lags = alignment.get_nominal_lags(drive.spec)
     else:
         lags = np.zeros(0)
     return TimingEstimate(offset, 0.0, {}, lags, np.full(len(lags), np.nan), False)
@@ -359,7 +359,7 @@ def _estimate_by_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
     latency = 0.0
     offset = 0.0
     early = 0.0
-    separated = bool(signals.select_moved_commands(recording.command).any())
+    separated = bool(alignment.select_moved_commands(recording.command).any())
     if separated:
         delay = _search_or_zero(
             make_state_residual(recording.command, state, drive.spec)
@@ -409,12 +409,12 @@ def average_expected_states(
     state = drive.recording.state
     start, end = twists.on_clock(timing.offset)
     if state is not None:
-        return signals.average_between_stamps(state.t, state.values, start, end)
+        return alignment.average_between_stamps(state.t, state.values, start, end)
     grid = np.arange(min(start[0], command.t[0]) - 1.0, end[-1] + 0.01, 0.01)
-    states = signals.infer_states(
+    states = alignment.infer_states(
         command, drive.spec, timing.lags, timing.latency, grid
     )
-    return signals.average_between_stamps(grid, states, start, end)
+    return alignment.average_between_stamps(grid, states, start, end)
 
 
 def list_responses(
@@ -425,8 +425,8 @@ def list_responses(
     if drive.recording.state is not None:
         return ()
     gains = np.ones(len(spec.state))
-    speed = signals.find_speed_index(spec)
-    moved = signals.select_moved_inputs(drive.recording.command, spec)
+    speed = alignment.find_speed_index(spec)
+    moved = alignment.select_moved_inputs(drive.recording.command, spec)
     if speed is not None and moved[speed]:
         expected = average_expected_states(drive, drive.twists, timing)[:, speed]
         driven = compute_forward_speed(drive, calibration)
@@ -452,7 +452,7 @@ def average_wheel_speeds(drive: Drive, calibration: Calibration) -> Array | None
     if wheels is None:
         return None
     start, end = drive.twists.on_clock(calibration.clock_offset_s)
-    return signals.average_between_stamps(wheels.t, wheels.values, start, end)
+    return alignment.average_between_stamps(wheels.t, wheels.values, start, end)
 
 
 def add_wheel_scales(drive: Drive, calibration: Calibration) -> Calibration:

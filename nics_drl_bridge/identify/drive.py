@@ -1,4 +1,4 @@
-"""Drive: a recording of a robot, with cached quantities that several stages derive from it."""
+"""Drive: a recording of a robot, what stages derive from it, and kinds of sentences on it."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.settings import Settings
-from nics_drl_bridge.identify.signals import (
-    DIFFERENCE,
+from nics_drl_bridge.identify.calibration import Settings
+from nics_drl_bridge.identify.statistics import (
     DIFFERENCE_GAIN,
+    DIFFERENCE_ORDER,
     GAUSSIAN_MAD,
-    unwrap_headings,
 )
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -150,6 +149,11 @@ class Bursts:
     newest: NDArray[np.intp]
 
 
+def unwrap_headings(pose: Array) -> Array:
+    """Returns poses (T, 3) with unwrapped headings."""
+    return np.concatenate([pose[:, :2], np.unwrap(pose[:, 2])[:, None]], axis=1)
+
+
 def find_bursts(t: Array) -> Bursts | None:
     """Finds bursts in stamps (T,) [s]; None if the samples arrive one by one."""
     if len(t) < MIN_STAMPS:
@@ -186,7 +190,7 @@ def measure_pose_noise(
         sigma = _spread_at_rest(unwrap_headings(pose.values))
     else:
         rest = measure_pose_residual(pose)
-        if len(rest) >= DIFFERENCE:
+        if len(rest) >= DIFFERENCE_ORDER:
             sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD
         else:
             sigma = None
@@ -199,13 +203,16 @@ def measure_pose_noise(
 def measure_pose_residual(pose: Stream) -> Array:
     """Returns sixth differences (n, 3) at the scale of the noise, over gap-free stretches."""
     rest = np.asarray(
-        np.diff(unwrap_headings(pose.values), DIFFERENCE, axis=0) / DIFFERENCE_GAIN
+        np.diff(unwrap_headings(pose.values), DIFFERENCE_ORDER, axis=0)
+        / DIFFERENCE_GAIN
     )
     if not len(rest):
         return rest
     span = np.diff(pose.t)
     even = np.abs(span - np.median(span)) < UNEVEN * np.median(span)
-    whole = np.convolve(even, np.ones(DIFFERENCE), "valid") > DIFFERENCE - 0.5
+    whole = (
+        np.convolve(even, np.ones(DIFFERENCE_ORDER), "valid") > DIFFERENCE_ORDER - 0.5
+    )
     return np.asarray(rest[whole]) if whole.mean() > LEAST_WHOLE else rest
 
 
@@ -234,3 +241,19 @@ class TwistIntervals:
     def on_clock(self, offset: float) -> tuple[Array, Array]:
         """Returns start and end on a clock that is ahead of the pose's by an offset."""
         return self.start + offset, self.end + offset
+
+
+class Gap(str):
+    """A sentence on something that a drive could not teach."""
+
+
+class Doubt(str):
+    """A sentence on something that looks wrong, but may be how the robot behaves."""
+
+
+class Alone(str):
+    """A sentence on a single recording with large errors."""
+
+
+class Mistake(str):
+    """A sentence on a wrong mapping; the model is only valid with that mapping."""

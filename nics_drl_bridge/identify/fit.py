@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import statistics
-from nics_drl_bridge.identify.settings import Alpha
-from nics_drl_bridge.identify.signals import GAUSSIAN_MAD, measure_white_noise
+from nics_drl_bridge.identify.calibration import Alpha
+from nics_drl_bridge.identify.statistics import GAUSSIAN_MAD, measure_white_noise
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec

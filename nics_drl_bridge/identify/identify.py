@@ -8,9 +8,13 @@ A stage is a function `(drive, findings) -> findings`. It may take its data from
   held out from the fit, to measure the sensors' noise, and to fit the final model.
 - `drive` is the drive as recorded. A stage takes from it the robot, the settings, the names of
   sources, and whether a state was measured: `derive_motion` adds one to the other two.
+
+Every drive that is not exact is fitted by what its model predicts, whether its state is the motion,
+follows the commands, or was measured (`terms.Kind`): see `fit_by_predictions` and
+`refine_by_predictions`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,8 +24,8 @@ import numpy as np
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.identify import clocks as timings
 from nics_drl_bridge.identify import fit as fitting
+from nics_drl_bridge.identify import hypotheses, open_loop, shooting
 from nics_drl_bridge.identify import judgement as judging
-from nics_drl_bridge.identify import open_loop, verdict
 from nics_drl_bridge.identify.alignment import (
     add_motion,
     align,
@@ -30,22 +34,42 @@ from nics_drl_bridge.identify.alignment import (
     make_motion_grid,
     make_surrogate,
 )
-from nics_drl_bridge.identify.calibration import Calibration, Response
-from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.calibration import (
+    Alpha,
+    Calibration,
+    Order,
+    Response,
+    Settings,
+)
+from nics_drl_bridge.identify.clocks import SEPARABLE_S
+from nics_drl_bridge.identify.drive import Doubt, Drive, Gap, Mistake
 from nics_drl_bridge.identify.findings import (
+    MIN_ROWS,
+    WORSE,
     Findings,
+    add_quality,
+    collect_notes,
+    describe_refit,
+    describe_replacement,
+    is_worse,
+    list_missed,
+    list_plain_calibration_notes,
+    measure_time_without_pose,
+    name_sum,
+    refuse_unexcited,
     require,
     require_fit,
     require_model,
     require_samples,
     resample_drive,
+    try_model,
 )
+from nics_drl_bridge.identify.fit import ORDER
 from nics_drl_bridge.identify.forms import (
-    CLEAR,
+    Evidence,
     drop_unreached_ends,
     find_input_curve,
     find_likely_delay,
-    list_driving_commands,
 )
 from nics_drl_bridge.identify.judgement import (
     estimate_bands,
@@ -54,10 +78,6 @@ from nics_drl_bridge.identify.judgement import (
 )
 from nics_drl_bridge.identify.mounting import apply_mounting, estimate_mounting
 from nics_drl_bridge.identify.noise import add_motion_noise, measure_sensor_noise
-from nics_drl_bridge.identify.prediction_fit import (
-    fit_by_predictions,
-    refine_by_predictions,
-)
 from nics_drl_bridge.identify.repair import (
     check_axes,
     check_commands,
@@ -67,24 +87,37 @@ from nics_drl_bridge.identify.repair import (
     correct_heading_by_gyro,
     repair_rows,
 )
-from nics_drl_bridge.identify.settings import Alpha, Order, Settings
-from nics_drl_bridge.identify.textbook_model import (
+from nics_drl_bridge.identify.terms import (
+    Kind,
+    Library,
+    drop_unused_terms,
+    share_effects,
+)
+from nics_drl_bridge.identify.textbook import (
+    Yardstick,
     add_actuator_state,
     assume_textbook,
+    fit_yardstick,
     make_actuated_spec,
     make_textbook_calibration,
     make_textbook_model,
     needs_actuators,
 )
-from nics_drl_bridge.identify.yardstick import Yardstick, fit_yardstick
 from nics_drl_bridge.recording.joining import LEARNT_SHARE, join
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
+from nics_drl_bridge.robot.kernels import MAX_ORDER
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import HorizonErrors, TaylorModel
 from nics_drl_bridge.threads import one_blas_thread
 
 Stage = Callable[[Drive, Findings], Findings]
+
+SHORT_S = 5.0  # a shorter drive can't tell the third and fourth order of a textbook
+TOO_SHORT = (
+    "The training part is too short to refine the model by its errors over seconds; record a "
+    "longer drive."
+)
 
 
 @one_blas_thread
@@ -204,7 +237,7 @@ class Identified:
     @property
     def gaps(self) -> tuple[str, ...]:
         """The notes on what the drive could not teach."""
-        return tuple(str(note) for note in self.notes if isinstance(note, verdict.Gap))
+        return tuple(str(note) for note in self.notes if isinstance(note, Gap))
 
     @property
     def train_until_s(self) -> float:
@@ -221,18 +254,18 @@ class Identified:
         """What the model is suitable for, and the reasons."""
         spec = self.drive.spec
         findings = self.findings
-        mistaken = any(isinstance(note, verdict.Mistake) for note in self.notes)
-        unfit = mistaken or bool(verdict.list_missed(self.fit, spec))
+        mistaken = any(isinstance(note, Mistake) for note in self.notes)
+        unfit = mistaken or bool(list_missed(self.fit, spec))
         textbook = bool(findings.replacement)
         ratings = [
             judging.rate(self.judgement, spec.footprint_radius, textbook),
             judging.rate_unseen(
-                verdict.measure_time_without_pose(self.drive), self.drive.duration_s
+                measure_time_without_pose(self.drive), self.drive.duration_s
             ),
         ]
         if unfit:
             ratings.append(judging.Assessment(judging.Verdict.DO_NOT_TRAIN, ()))
-        doubtful = any(isinstance(note, verdict.Doubt) for note in self.notes)
+        doubtful = any(isinstance(note, Doubt) for note in self.notes)
         doubtful |= any(
             judging.list_doubts_of_commands(self.judgement, self.calibration)
         )
@@ -244,15 +277,6 @@ class Identified:
     def verdict(self) -> judging.Verdict:
         """What the model is suitable for, as one of three verdicts."""
         return self.assessment.verdict
-
-    @property
-    def dead_zone(self) -> float:
-        """Maximum of the driving command at which the robot stays at rest; 0 if none."""
-        spec = self.drive.spec
-        driving = set(list_driving_commands(spec))
-        if not driving:  # no textbook says what each command moves
-            driving = {c.name for c in spec.command if not c.turns and c.unit != "rad"}
-        return _find_dead_zone(self.model, driving)
 
     @property
     def alpha(self) -> Alpha:
@@ -280,24 +304,6 @@ def _make_result(trial: Findings, final: Findings) -> Identified:
         findings=trial,
         notes=final.notes,
     )
-
-
-def _find_dead_zone(model: TaylorModel, driving: set[str]) -> float:
-    """Returns the largest command of those that drive at which no state starts to move.
-
-    A state with dry friction starts when the effect of its command exceeds the friction.
-    """
-    dead = {c.command: c.dead for c in model.inputs if c.command in driving}
-    zones = [0.0, *dead.values()]
-    for i, place in enumerate(model.state_size + model.drivers):
-        if model.variables[place] not in driving:
-            continue
-        alone = np.arange(len(model.variables)) == place
-        gain = abs(model.coefficients[3 + i, (model.powers == alone).all(axis=1)].sum())
-        if model.friction[i] * gain > 0.0:
-            zone = dead.get(model.variables[place], 0.0)
-            zones.append(zone + float(model.friction[i] / gain))
-    return max(zones)
 
 
 def repair_drive(drive: Drive, findings: Findings) -> Findings:
@@ -405,18 +411,14 @@ def find_input_curves(drive: Drive, findings: Findings) -> Findings:
     findings = _with_likely_latency(findings)
     samples = resample_drive(training, findings)
     curves = []
-    clear = []
     for place in range(len(drive.spec.command)):
         candidate = find_input_curve(samples, drive.spec, place)
-        if candidate is None:
-            continue
-        curves.append(candidate.curve)
-        if candidate.gain >= CLEAR:
-            clear.append(candidate.curve)
+        if candidate is not None:
+            curves.append(candidate.curve)
     if not curves:
         return findings
     calibration = replace(findings.calibration, inputs=tuple(curves))
-    findings = replace(findings, calibration=calibration, clear_curves=tuple(clear))
+    findings = replace(findings, calibration=calibration)
     return _with_likely_latency(findings)  # the curves may hide a part of it
 
 
@@ -445,7 +447,7 @@ def fit_terms(drive: Drive, findings: Findings) -> Findings:
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
     if settings.strict:
-        verdict.refuse_unexcited(regression.excitation, drive.spec)
+        refuse_unexcited(regression.excitation, drive.spec)
     return replace(findings, samples=samples, regression=regression)
 
 
@@ -486,16 +488,16 @@ def judge_model(drive: Drive, findings: Findings) -> Findings:
         samples = open_loop.infer_samples(model, calibration, whole, samples)
     held_out_from = whole.recording.pose.t[0] + calibration.clock_offset_s + until
     unseen: Samples | None = samples.rows(samples.t > held_out_from)
-    if unseen is not None and len(unseen.t) < verdict.MIN_ROWS:
+    if unseen is not None and len(unseen.t) < MIN_ROWS:
         unseen = None
-    held_out = verdict.try_model(model, calibration, whole, until)
+    held_out = try_model(model, calibration, whole, until)
     yardstick = findings.yardstick or fit_textbook(whole, calibration)
     bands = _find_bands(drive, findings)
     judgement = judge_predictions(model, calibration, whole, bands, yardstick)
-    rated = verdict.add_quality(model, fit, unseen, held_out, judgement, drive.spec)
+    rated = add_quality(model, fit, unseen, held_out, judgement, drive.spec)
     if model is fit.model:
         fit = replace(fit, model=rated)
-    notes = verdict.list_plain_calibration_notes(findings)
+    notes = list_plain_calibration_notes(findings)
     findings = replace(
         findings,
         pruned_fit=fit,
@@ -507,7 +509,7 @@ def judge_model(drive: Drive, findings: Findings) -> Findings:
         calibration=replace(calibration, notes=notes),
         noise=add_motion_noise(findings.noise, whole, calibration, model, samples),
     )
-    return replace(findings, notes=verdict.collect_notes(drive, findings))
+    return replace(findings, notes=collect_notes(drive, findings))
 
 
 def _find_bands(drive: Drive, findings: Findings) -> dict[float, float]:
@@ -584,7 +586,7 @@ def _try_textbook(
         refinement=(),
         trials=(),
         assumptions=(),
-        replacement=verdict.describe_replacement(lost),
+        replacement=describe_replacement(lost),
     )
     return judge_model(drive, start)
 
@@ -612,18 +614,18 @@ def refit_model(drive: Drive, findings: Findings) -> Findings:
         return findings
     final = _fit_whole_drive(drive, findings)
     driven = drive.recording.driven_s
-    sentence = verdict.describe_refit(driven(until), driven(), worse=final is None)
+    sentence = describe_refit(driven(until), driven(), worse=final is None)
     if final is None:
         findings = replace(findings, refinement=(*findings.refinement, sentence))
-        return replace(findings, notes=verdict.collect_notes(drive, findings))
-    notes = verdict.list_plain_calibration_notes(final)
+        return replace(findings, notes=collect_notes(drive, findings))
+    notes = list_plain_calibration_notes(final)
     final = replace(
         final,
         refinement=(*final.refinement, sentence),
         calibration=replace(final.calibration, notes=notes),
         model=replace(require_model(final), quality=require_model(findings).quality),
     )
-    final = replace(final, notes=verdict.collect_notes(drive, final))
+    final = replace(final, notes=collect_notes(drive, final))
     return replace(findings, final=final)
 
 
@@ -639,7 +641,7 @@ def _fit_whole_drive(drive: Drive, findings: Findings) -> Findings | None:
         trial_error_m = _measure_mean_error(findings, until)
     except (FitError, RecordingError):
         return None
-    return None if verdict.is_worse(error_m, trial_error_m) else final
+    return None if is_worse(error_m, trial_error_m) else final
 
 
 def _measure_mean_error(findings: Findings, until: float) -> float:
@@ -709,6 +711,206 @@ def _find_clock_offset(recording: Recording, spec: RobotSpec) -> float:
         raise RecordingError(
             f"{fault}; record pose and commands by one clock."
         ) from None
+
+
+def fit_by_predictions(drive: Drive, findings: Findings) -> Findings:
+    """Fits the order that best predicts parts of the training part that its fits did not see."""
+    training = findings.training
+    order = drive.settings.order
+    library = make_library(drive, findings)
+    samples = resample_drive(training, findings)
+    evidence = Evidence(training, findings.calibration, samples, library)
+    try:
+        base, trials = _fit_base(findings, evidence, order)
+    except FitError as error:
+        raise FitError(f"{drive.recording.source}: {error}") from None
+    best = hypotheses.choose_trial(trials, order)
+    curves = base.draft.form.make_curves(base.found.named)
+    if library.kind is Kind.MOTION:
+        calibration = replace(findings.calibration, inputs=curves)
+        findings = replace(findings, calibration=calibration)
+        samples = resample_drive(training, findings)
+    else:
+        samples = base.draft.select(None)
+    fit = library.fit(samples, best.order or library.order)
+    if drive.settings.strict:
+        refuse_unexcited(fit.regression.excitation, drive.spec)
+    return replace(
+        findings,
+        samples=samples,
+        regression=fit.regression,
+        pruned_fit=fit,
+        model=replace(fit.model, inputs=curves),
+        trials=trials,
+        base=base,
+    )
+
+
+def _fit_base(
+    findings: Findings, evidence: Evidence, order: Order
+) -> tuple[hypotheses.Base, tuple[hypotheses.Trial, ...]]:
+    """Fits the base, and tries orders of terms beyond it; a refit reuses both choices."""
+    if findings.base is None:
+        base = hypotheses.fit_base(evidence)
+    else:
+        base = hypotheses.refit_base(evidence, findings.base)
+    asked = hypotheses.list_hypotheses(order, evidence.library)
+    return base, findings.trials or base.draft.cross_validate(asked)
+
+
+def make_library(drive: Drive, findings: Findings) -> Library:
+    """Returns the terms that the model of a drive may have."""
+    order = drive.settings.order
+    if not drive.spec.state or findings.motion_width_s is not None:
+        return Library(drive.spec, Kind.MOTION, True, 1.0, hypotheses.BASE_ORDER)
+    kind = Kind.FOLLOWER if drive.recording.state is None else Kind.MEASURED
+    centred = "lever_arm_y_m" in findings.calibration.uncertainty
+    if order == "auto":
+        is_short = findings.training.duration_s < SHORT_S
+        order = ORDER if kind is Kind.MEASURED or is_short else MAX_ORDER
+    return Library(drive.spec, kind, centred, drive.settings.alpha, order)
+
+
+def refine_by_predictions(drive: Drive, findings: Findings) -> Findings:
+    """Adjusts terms, delays and mounting to predictions over seconds."""
+    order = drive.settings.order
+    base = require(findings.base, "the base", "fit_terms")
+    best = hypotheses.choose_trial(findings.trials, order)
+    terms = require_fit(findings).model
+    calibration = findings.calibration
+    draft = base.draft
+    found, has_order = _search_model(draft, base, terms, best)
+    if draft.problem.is_mounted:
+        certain = hypotheses.drop_doubtful_mounting(draft, calibration, found)
+        if certain is not None:
+            errors = hypotheses.add_predicted_mounting(calibration, found).uncertainty
+            calibration = replace(calibration, uncertainty=errors)
+            draft = certain
+            found, has_order = _search_model(draft, base, terms, best)
+    if draft.library.kind is not Kind.MOTION:
+        found = draft.prune(found, drive.settings.alpha)
+    before_s = draft.form.find_latency(found.named)
+    calibration = draft.calibrate(found, calibration)
+    draft = _start_calibrated(draft, found, before_s - calibration.command_latency_s)
+    base = replace(base, draft=draft)
+    if draft.library.kind is Kind.MOTION:
+        calibration, sums = _separate_lags(base, calibration, drive.spec)
+    else:
+        calibration = _add_sums(calibration, found, draft)
+        sums = ()
+    model = draft.add_errors(found, terms)
+    model = replace(model, inputs=calibration.inputs)
+    model = share_effects(model, drive.spec, require_samples(findings))
+    return replace(
+        findings,
+        calibration=calibration,
+        model=drop_unused_terms(model),
+        base=base,
+        refinement=(
+            _describe_refinement(draft.problem.longest_horizon_s),
+            *sums,
+            *hypotheses.describe_forms(base, findings.trials, order),
+            *_list_unused_options(drive, draft.library, best.order, has_order),
+        ),
+    )
+
+
+def _start_calibrated(
+    draft: hypotheses.Draft, found: shooting.Predictive, latency_s: float
+) -> hypotheses.Draft:
+    """Returns a draft that starts from the values found, less what the calibration has of them.
+
+    That is the mounting, and a part of the latency [s].
+    """
+    is_mounting = np.isin(found.names, hypotheses.MOUNTING)
+    parameters = draft.problem.parameters
+    parameters = replace(parameters, start=np.where(is_mounting, 0.0, found.values))
+    parameters = parameters.shift_stamps(latency_s)
+    return replace(draft, problem=replace(draft.problem, parameters=parameters))
+
+
+def _add_sums(
+    calibration: Calibration, found: shooting.Predictive, draft: hypotheses.Draft
+) -> Calibration:
+    """Adds the errors of sums of latency and lag, which are told where noise hides the parts."""
+    errors = dict(calibration.uncertainty)
+    if not errors.get("command_latency_s", 0.0) > SEPARABLE_S:
+        return calibration
+    names = list(found.names)
+    for state, command in draft.form.followed:
+        delay = f"{command}.delay"
+        pair = [names.index(delay if delay in names else "latency")]
+        pair.append(names.index(f"{state}.lag"))
+        variance = float(found.value_covariance[np.ix_(pair, pair)].sum())
+        errors[name_sum(state)] = float(np.sqrt(max(variance, 0.0)))
+    return replace(calibration, uncertainty=errors)
+
+
+def _search_model(
+    draft: hypotheses.Draft,
+    base: hypotheses.Base,
+    terms: TaylorModel,
+    best: hypotheses.Trial,
+) -> tuple[shooting.Predictive, bool]:
+    """Searches for the best-predicting model of the best order.
+
+    The textbook's terms alone are kept if the search for more diverges. Also returns whether the
+    model has the terms of the chosen order.
+
+    Args:
+        draft: the form of the model and its prediction problem.
+        base: the fitted textbook, where the search starts.
+        terms: the terms beyond the textbook's, as fitted by least squares.
+        best: the chosen order.
+    """
+    if best.pull:
+        refined = draft.refine(base.found.model, terms, pull=best.pull)
+        errors = (
+            draft.problem.measure_mean_error(fitted.model, fitted.values)
+            for fitted in (refined, base.found)
+        )
+        if not is_worse(*errors):
+            return refined, True
+    textbook = draft.fit_base(other=base.found.model)
+    return textbook, best.pull == 0.0
+
+
+def _separate_lags(
+    base: hypotheses.Base, calibration: Calibration, spec: RobotSpec
+) -> tuple[Calibration, tuple[str, ...]]:
+    """Drops the latency's error where lags hide it; returns a sentence on their sums instead."""
+    form = base.draft.form
+    curves = form.make_curves(base.found.named)
+    lags = hypotheses.find_lags(replace(base.found.model, inputs=curves), spec)
+    if not lags:
+        return calibration, ()
+    beside = form.find_latency(base.found.named)
+    sums = hypotheses.describe_lag_sums(calibration.command_latency_s, lags, beside)
+    errors = dict(calibration.uncertainty)
+    errors.pop("command_latency_s", None)
+    return replace(calibration, uncertainty=errors), (sums,)
+
+
+def _describe_refinement(horizon_s: float) -> str:
+    """States the longest horizon of the predictions [s]; 0 if none fitted into the drive."""
+    if horizon_s == 0.0:
+        return TOO_SHORT
+    by = f"the open-loop errors over up to {horizon_s:g} s"
+    return f"Coefficients and calibration were refined by {by}."
+
+
+def _list_unused_options(
+    drive: Drive, library: Library, order: int, has_order: bool
+) -> Iterator[str]:
+    """Yields a sentence per option that had no effect on the model."""
+    settings = drive.settings
+    if settings.alpha != "auto" and library.kind is Kind.MOTION:
+        why = "where the state is the motion, or there is none, predictions weight the terms"
+        yield f"alpha = {settings.alpha:g} was not used: {why}."
+    if settings.order != "auto" and not has_order:
+        off = f"more than {WORSE:g} times as far off as the textbook's, or diverge"
+        why = f"predictions with its terms are {off}, so only the textbook's were kept"
+        yield f"order = {order} was not used: {why}."
 
 
 STAGES = list_stages()

@@ -22,7 +22,7 @@ from nics_drl_bridge.identify.open_loop import (
     predict,
     select_windows,
 )
-from nics_drl_bridge.identify.yardstick import (
+from nics_drl_bridge.identify.textbook import (
     Yardstick,
     estimate_twists_at,
     fit_yardstick,

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify import clocks
-from nics_drl_bridge.identify.alignment import has_motion_as_state
-from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.drive import Drive, TwistIntervals
-from nics_drl_bridge.identify.signals import (
+from nics_drl_bridge.identify.alignment import (
     average_held,
     find_speed_index,
+    has_motion_as_state,
     list_followed_commands,
 )
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.statistics import (
     CERTAIN,
     estimate_clustered_errors,

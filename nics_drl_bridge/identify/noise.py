@@ -9,7 +9,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, find_bursts, measure_pose_noise
-from nics_drl_bridge.identify.signals import measure_white_noise
+from nics_drl_bridge.identify.statistics import measure_white_noise
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.noise import (
     ASSUMED_STATE_DRIFT,

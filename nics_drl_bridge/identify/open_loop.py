@@ -8,10 +8,13 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.alignment import resample_states
+from nics_drl_bridge.identify.alignment import (
+    average_effect,
+    list_followed_commands,
+    resample_states,
+)
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.signals import average_effect, list_followed_commands
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -87,7 +90,7 @@ def select_windows(
     good &= episode[begin] == episode[end]
     begin = begin[good]
     end = end[good]
-    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
+    length = geometry.measure_path(pose)
     return Windows(
         t[begin], t[end], pose[begin], pose[end], length[end] - length[begin]
     )

@@ -11,16 +11,14 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.forms import list_driving_commands
-from nics_drl_bridge.identify.signals import (
+from nics_drl_bridge.identify.alignment import (
     average_between_stamps,
     average_held,
     select_moved_commands,
-    unwrap_headings,
 )
+from nics_drl_bridge.identify.drive import Doubt, Drive, Gap, Mistake, unwrap_headings
+from nics_drl_bridge.identify.forms import list_driving_commands
 from nics_drl_bridge.identify.statistics import compute_unexplained
-from nics_drl_bridge.identify.verdict import Doubt, Gap, Mistake
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.heading import (
     CLEARLY,

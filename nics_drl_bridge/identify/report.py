@@ -9,6 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nics_drl_bridge.identify.alignment import select_moved_commands
+from nics_drl_bridge.identify.calibration import Alpha
+from nics_drl_bridge.identify.drive import Alone, Doubt, Mistake
+from nics_drl_bridge.identify.findings import (
+    FAR_OFF,
+    describe_coarsest_state,
+    list_missed,
+)
 from nics_drl_bridge.identify.fit import describe_narrow_commands
 from nics_drl_bridge.identify.hypotheses import PRUNING, list_candidates
 from nics_drl_bridge.identify.identify import Identified
@@ -18,17 +26,7 @@ from nics_drl_bridge.identify.judgement import (
     select_usual_horizon,
 )
 from nics_drl_bridge.identify.repair import describe_reference
-from nics_drl_bridge.identify.settings import Alpha
-from nics_drl_bridge.identify.signals import select_moved_commands
 from nics_drl_bridge.identify.statistics import Curve
-from nics_drl_bridge.identify.verdict import (
-    FAR_OFF,
-    Alone,
-    Doubt,
-    Mistake,
-    describe_coarsest_state,
-    list_missed,
-)
 from nics_drl_bridge.robot.kinds import describe_overdrive
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
@@ -162,7 +160,7 @@ def list_units(spec: RobotSpec) -> dict[str, str]:
 def list_motor_effects(identified: Identified) -> Iterator[str]:
     """Yields a line per parameter of a motor or an input curve, with its uncertainty.
 
-    The names are `throttle.dead`, `.least`, `.most`, `.back` and `.delay` for a command, `vx.fall`,
+    The names are `throttle.dead`, `.least`, `.most` and `.delay` for a command, `vx.fall`,
     `.rise`, `.friction` and `.drag` for a state, and `vx.back_emf.throttle` for a pair.
     """
     sigma = identified.calibration.uncertainty
@@ -186,7 +184,6 @@ Effect = tuple[str, str, str, float, str, float]
 def _list_curve_effects(model: TaylorModel, units: Mapping[str, str]) -> list[Effect]:
     """Lists the parameters of the input curves."""
     effects: list[Effect] = []
-    back = "reverse gain, relative to forward"
     for curve in model.inputs:
         name = curve.command
         unit = units[name]
@@ -195,7 +192,6 @@ def _list_curve_effects(model: TaylorModel, units: Mapping[str, str]) -> list[Ef
             (name, "dead", dead, curve.dead, unit, 0.0),
             (name, "least", "saturates below", curve.least, unit, -np.inf),
             (name, "most", "saturates above", curve.most, unit, np.inf),
-            (name, "back", back, curve.back, "", 1.0),
             (name, "delay", "delay after the common latency", curve.delay, "s", 0.0),
         ]
     return effects

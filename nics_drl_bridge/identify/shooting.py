@@ -141,7 +141,7 @@ class Shooting:
             np.abs(apart) < SAME_STEP * dt * steps
         )
         if inside is not None:
-            outside = np.append(0, np.cumsum(~inside))
+            outside = geometry.accumulate(~inside)
             whole &= outside[end] == outside[first][:, None]
         is_used = whole.any(axis=1)
         return first[is_used], np.where(whole, steps, 0)[is_used]
@@ -165,9 +165,7 @@ class Shooting:
 
     def measure_paths(self, first: Rows, steps: Rows) -> Array:
         """Returns the lengths (W, H) of the measured paths over windows [m]."""
-        length = np.append(
-            0.0, np.cumsum(np.hypot(*np.diff(self.samples.q[:, :2], axis=0).T))
-        )
+        length = geometry.measure_path(self.samples.q)
         return np.asarray(length[first[:, None] + steps] - length[first][:, None])
 
     def predict(
@@ -308,7 +306,7 @@ class _Path:
     def along(cls, twist: Array, dt: float) -> "_Path":
         """Integrates twists (3, T) along arcs over steps of dt [s]."""
         turn = dt * twist[2]
-        heading = np.append(0.0, np.cumsum(turn))
+        heading = geometry.accumulate(turn)
         middle = heading[:-1] + turn / 2.0
         chord = dt * np.sinc(turn / (2.0 * np.pi))
         ahead = chord * np.stack([np.cos(middle), np.sin(middle)])

@@ -32,6 +32,12 @@ EASIER = 1.0 / 3.0  # smallest factor of the damping after a successful step
 BLOCKS = 5
 # terms that lower the error by less than this fraction of the rates' size are dropped
 WORTH = 1e-3
+# Sixth differences cancel smooth motion (polynomials up to the fifth order) and leave white noise,
+# which they amplify by the root of the sum of their squared weights.
+DIFFERENCE_ORDER = 6
+DIFFERENCE_GAIN = np.sqrt(924.0)
+# median absolute deviation of a normal distribution with a standard deviation of 1
+GAUSSIAN_MAD = 0.6745
 
 
 def compute_unexplained(chi: Array, signal: Array) -> Array:
@@ -270,6 +276,14 @@ def compute_condition(chi: Array) -> float:
     spread = chi.std(axis=0)
     size = np.linalg.svd(chi / np.where(spread > 0.0, spread, 1.0), compute_uv=False)
     return float(size[0] / size[-1]) if size[-1] > 0.0 else float("inf")
+
+
+def measure_white_noise(values: Array) -> Array:
+    """Returns the standard deviation (D,) of white noise on otherwise smooth series (T, D)."""
+    rest = np.diff(values, DIFFERENCE_ORDER, axis=0) / DIFFERENCE_GAIN
+    if len(rest) < DIFFERENCE_ORDER:
+        return np.zeros(values.shape[1])
+    return np.asarray(np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD)
 
 
 def measure_rate_errors(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:

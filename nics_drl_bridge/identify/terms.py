@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify.alignment import find_speed_index
+from nics_drl_bridge.identify.calibration import Alpha
 from nics_drl_bridge.identify.fit import (
     ORDER,
     STILL,
@@ -39,9 +41,7 @@ from nics_drl_bridge.identify.fit import (
     regress,
     select_twist_terms,
 )
-from nics_drl_bridge.identify.settings import Alpha
-from nics_drl_bridge.identify.signals import find_speed_index
-from nics_drl_bridge.identify.yardstick import probe_structure
+from nics_drl_bridge.identify.textbook import probe_structure
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.kernels import MAX_ORDER
 from nics_drl_bridge.robot.kinds import compute_steady_twist, slips, textbook

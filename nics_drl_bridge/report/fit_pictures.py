@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify.alignment import average_held
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.open_loop import (
     HORIZON_S,
@@ -18,7 +19,6 @@ from nics_drl_bridge.identify.open_loop import (
     predict,
     select_windows,
 )
-from nics_drl_bridge.identify.signals import average_held
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.curve import InputCurve

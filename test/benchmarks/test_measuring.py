@@ -18,7 +18,7 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import select_windows
-from nics_drl_bridge.identify.yardstick import fit_yardstick
+from nics_drl_bridge.identify.textbook import fit_yardstick
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.recording.readers import open_drive, read_recording
 from nics_drl_bridge.recording.recording import Stream

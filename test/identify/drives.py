@@ -14,8 +14,8 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.identify import identify as stages
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.findings import collect_calibration_notes
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.verdict import collect_calibration_notes
 from nics_drl_bridge.recording.recording import Recording, Stream, check
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import RobotSpec, build_robot

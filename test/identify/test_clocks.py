@@ -11,7 +11,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import SEPARABLE_S, measure_timing
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.verdict import describe_clocks
+from nics_drl_bridge.identify.findings import describe_clocks
 
 
 @pytest.mark.slow

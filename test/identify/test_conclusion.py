@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nics_drl_bridge.identify.drive import Gap, Mistake
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.judgement import Verdict
 from nics_drl_bridge.identify.report import (
@@ -15,7 +16,6 @@ from nics_drl_bridge.identify.report import (
     format_opening,
     format_report,
 )
-from nics_drl_bridge.identify.verdict import Gap, Mistake
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import build_robot, load_robot
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors

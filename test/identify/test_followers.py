@@ -75,7 +75,6 @@ def test_a_dead_zone_is_found_and_predicted_and_not_taken_for_a_mounting(seed):
     assert (curve.command, curve.least, curve.most) == (SPEED, -np.inf, np.inf)
     assert curve.dead == pytest.approx(0.1, rel=0.1)
     assert abs(curve.dead - 0.1) < 3.0 * calibration.uncertainty[f"{SPEED}.dead"]
-    assert identified.dead_zone == curve.dead
     error, textbook = ends(identified)
     assert error < textbook  # whose offset acts like a dead zone
     assert np.abs(off(calibration, (0.0, 0.0, 0.0))).max() < 3.0

@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from identify.drives import make_model, slipping_car, throttle_car
+from nics_drl_bridge.identify.calibration import Settings
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.findings import Findings, resample_drive
 from nics_drl_bridge.identify.forms import (
     Evidence,
     Form,
-    add_dead_zones,
-    add_reverse_gains,
+    add_dead_zone,
     drop_unreached_ends,
     find_input_curve,
-    find_two_way_curves,
     list_parameters,
     make_prediction_problem,
 )
 from nics_drl_bridge.identify.identify import (
     STAGES,
-    Identified,
     find_input_curves,
     run,
 )
-from nics_drl_bridge.identify.settings import Settings
 from nics_drl_bridge.identify.terms import Kind, Library
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
@@ -85,7 +81,7 @@ def test_a_command_that_does_not_drive_a_robot_has_no_curve_by_its_speed(
 
 
 def test_values_are_sought_by_name_from_what_the_motion_shows(evidence):
-    form = Form((CURVE,), friction=("vx",), limits=("vx",), drag=("vx",))
+    form = Form((CURVE,), resisted=("vx",), limits=("vx",))
     sought = list_parameters(evidence, form)
     assert sought.names == (
         "latency",
@@ -106,7 +102,9 @@ def test_values_are_sought_by_name_from_what_the_motion_shows(evidence):
 def test_a_form_that_grows_starts_where_the_smaller_one_ended(evidence):
     small = list_parameters(evidence, Form((CURVE,)))
     ended = replace(small, start=small.start + np.array([0.02, 0.01, 0.0, 0.03]))
-    larger = list_parameters(evidence, Form((CURVE,), drag=("vx",))).start_from(ended)
+    larger = list_parameters(evidence, Form((CURVE,), resisted=("vx",))).start_from(
+        ended
+    )
     assert larger.start[:4] == pytest.approx(ended.start)
     assert larger.start[4] > 0.0
 
@@ -129,14 +127,12 @@ def test_the_least_delay_of_the_commands_is_their_latency(evidence):
 
 
 def test_values_become_curves_friction_limits_and_drag(evidence):
-    form = Form((CURVE,), ("vx",), ("vx",), ("throttle",), ("vx",))
+    form = Form((CURVE,), resisted=("vx",), limits=("vx",))
     sought = list_parameters(evidence, form)
-    values = np.array([0.03, 0.12, -0.2, 0.4, 0.8, 0.25, 0.15, 1.2, 3.0, 2.0])
+    values = np.array([0.03, 0.12, -0.2, 0.4, 0.25, 0.15, 1.2, 3.0, 2.0])
     at = sought.name(values)
     (curve,) = form.make_curves(at)
-    assert curve == InputCurve(
-        command="throttle", dead=0.12, least=-0.2, most=0.4, back=0.8
-    )
+    assert curve == InputCurve(command="throttle", dead=0.12, least=-0.2, most=0.4)
     spec = evidence.drive.spec
     model = form.actuate(make_model(spec, {"vx": {"vx": 1.0}}), at)
     assert model.friction.tolist() == [0.25, 0.0, 0.0]
@@ -145,26 +141,11 @@ def test_values_become_curves_friction_limits_and_drag(evidence):
     assert model.limits[0].tolist() == [-3.0, 2.0]
 
 
-def test_a_dead_zone_is_tried_of_the_command_that_drives_alone(evidence):
-    (curve,) = add_dead_zones(Form(), evidence).curves
+def test_a_command_is_given_one_dead_zone_by_its_name(evidence):
+    (curve,) = add_dead_zone(Form(), evidence, "throttle").curves
     assert curve.command == "throttle"
     assert 0.0 < curve.dead < 0.05
-    assert add_dead_zones(Form((CURVE,)), evidence).curves == (CURVE,)
-    assert add_reverse_gains(add_dead_zones(Form(), evidence), (curve,)).back == (
-        "throttle",
-    )
-
-
-def test_only_a_command_that_drives_both_ways_may_have_a_gain_of_its_own_backwards(
-    evidence,
-):
-    (both,) = find_two_way_curves(evidence)
-    assert both.command == "throttle"
-    form = add_reverse_gains(Form(), (both,))
-    assert form.back == ("throttle",)
-    assert len(list_parameters(evidence, form).sought) == 4  # it has no dead zone
-    forwards = replace(evidence.samples, x=np.abs(evidence.samples.x))
-    assert find_two_way_curves(replace(evidence, samples=forwards)) == ()
+    assert add_dead_zone(Form((CURVE,)), evidence, "throttle").curves == (CURVE,)
 
 
 def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, samples):
@@ -190,18 +171,3 @@ def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, sample
     assert within.inputs[0].most == pytest.approx(0.8 * sent.max())
     assert within.inputs[0].least == -np.inf
     assert within.limits[0].tolist() == [-np.inf, 0.5 * asked.max()]
-
-
-def test_the_dead_zone_of_a_steering_is_none_of_the_drive():
-    spec = throttle_car()
-    inputs = (
-        InputCurve(command="throttle", dead=0.1),
-        InputCurve(command="steering", dead=0.3),
-    )
-    terms = {"d_vx": {"throttle": 9.0}, "d_wz": {"steering": 9.0}}
-    model = make_model(spec, terms, inputs=inputs)
-    found = SimpleNamespace(model=model, drive=SimpleNamespace(spec=spec))
-    assert Identified.dead_zone.fget(found) == 0.1
-    rubbing = replace(model, friction=np.array([0.9, 0.0, 9.0]))
-    found.model = rubbing
-    assert Identified.dead_zone.fget(found) == pytest.approx(0.2)

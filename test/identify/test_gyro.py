@@ -9,9 +9,9 @@ import pytest
 from skid_steer import BIAS, OVER_REPORTED, drive_skid_steer
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.identify.drive import Mistake
 from nics_drl_bridge.identify.identify import join_recordings
 from nics_drl_bridge.identify.repair import correct_heading_by_gyro, describe_reference
-from nics_drl_bridge.identify.verdict import Mistake
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import build_robot
 

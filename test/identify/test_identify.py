@@ -7,6 +7,7 @@ import pytest
 
 from identify.drives import NOISE, drive, fit_trial, make_model, scale, with_values
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.identify.calibration import Settings
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.findings import Findings
 from nics_drl_bridge.identify.identify import (
@@ -18,8 +19,7 @@ from nics_drl_bridge.identify.identify import (
     run,
 )
 from nics_drl_bridge.identify.open_loop import predict, select_windows
-from nics_drl_bridge.identify.settings import Settings
-from nics_drl_bridge.identify.textbook_model import assume_textbook
+from nics_drl_bridge.identify.textbook import assume_textbook
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.spec import RobotSpec, build_robot, load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel

@@ -13,15 +13,11 @@ from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.generator import generate, mount_lidar
 from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.drive import Alone, Drive
+from nics_drl_bridge.identify.findings import describe_gaps, measure_time_without_pose
 from nics_drl_bridge.identify.identify import join_recordings
 from nics_drl_bridge.identify.report import conclude, format_report
 from nics_drl_bridge.identify.shooting import Parameters, Shooting
-from nics_drl_bridge.identify.verdict import (
-    Alone,
-    describe_gaps,
-    measure_time_without_pose,
-)
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.spec import build_robot
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from identify.drives import NOISE, drive
-from nics_drl_bridge.identify import verdict
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify, refit_model
 from nics_drl_bridge.identify.judgement import HORIZONS_S
@@ -74,7 +73,7 @@ def test_the_model_is_of_all_data_and_the_judgement_of_its_trial(found):
 
 @pytest.mark.slow
 def test_a_refit_that_knows_the_first_part_worse_is_not_believed(found, monkeypatch):
-    monkeypatch.setattr(verdict, "WORSE", 0.0)
+    monkeypatch.setattr("nics_drl_bridge.identify.findings.WORSE", 0.0)
     findings = refit_model(found.drive, replace(found.findings, final=None))
     assert findings.final is None
     assert any("covers only the first 26.7 s" in note for note in findings.notes)

@@ -21,7 +21,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.alignment import align
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.drive import Doubt, Drive, Gap, Mistake
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.repair import (
@@ -31,7 +31,6 @@ from nics_drl_bridge.identify.repair import (
     check_units,
     repair_rows,
 )
-from nics_drl_bridge.identify.verdict import Doubt, Gap, Mistake
 from nics_drl_bridge.recording.recording import (
     Recording,
     Samples,

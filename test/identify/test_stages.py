@@ -8,18 +8,20 @@ import numpy as np
 import pytest
 
 from identify.drives import drive, slipping_car
-from nics_drl_bridge.identify import clocks, verdict
+from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify import identify as stages
-from nics_drl_bridge.identify.calibration import Response
+from nics_drl_bridge.identify.calibration import Response, Settings
 from nics_drl_bridge.identify.clocks import make_nominal_timing
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.findings import StageOrderError
+from nics_drl_bridge.identify.findings import (
+    StageOrderError,
+    describe_responses,
+    is_worse,
+)
 from nics_drl_bridge.identify.identify import (
     STAGES,
     run,
 )
-from nics_drl_bridge.identify.settings import Settings
-from nics_drl_bridge.identify.verdict import describe_responses
 from nics_drl_bridge.robot.spec import RobotSpec
 
 
@@ -49,7 +51,7 @@ def test_a_follower_beside_a_motion_has_the_lag_and_the_error_of_its_own_command
     ("error", "worse"), [(1.2, False), (1.3, True), (np.nan, True)]
 )
 def test_a_refit_is_worse_if_it_predicts_clearly_worse_or_not_at_all(error, worse):
-    assert verdict.is_worse(error, 1.0) == worse
+    assert is_worse(error, 1.0) == worse
 
 
 def test_a_stage_in_the_wrong_place_says_which_it_needs(car):

@@ -6,8 +6,8 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.identify.calibration import parse_alpha
 from nics_drl_bridge.identify.fit import fit
-from nics_drl_bridge.identify.settings import parse_alpha
 from nics_drl_bridge.identify.statistics import (
     compute_condition,
     cross_validated,

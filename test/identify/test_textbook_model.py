@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from identify.drives import make_model
-from nics_drl_bridge.identify.textbook_model import make_textbook_model
-from nics_drl_bridge.identify.yardstick import (
+from nics_drl_bridge.identify.textbook import (
     TextbookResponse,
     Yardstick,
+    make_textbook_model,
     probe_structure,
 )
 from nics_drl_bridge.recording.recording import Samples

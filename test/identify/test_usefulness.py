@@ -9,10 +9,10 @@ import pytest
 from identify.drives import drive, fit_trial, with_values
 from nics_drl_bridge.identify import judgement
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.findings import describe_coarsest_state
 from nics_drl_bridge.identify.identify import identify, prefer_textbook
 from nics_drl_bridge.identify.open_loop import measure_open_loop_error
 from nics_drl_bridge.identify.report import explain_uselessness, is_useless
-from nics_drl_bridge.identify.verdict import describe_coarsest_state
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import RobotSpec

@@ -12,7 +12,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import select_windows
-from nics_drl_bridge.identify.yardstick import (
+from nics_drl_bridge.identify.textbook import (
     estimate_twists_at,
     fit_yardstick,
     predict_kept_twist,

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.identify.signals import lag_behind, resample
+from nics_drl_bridge.identify.alignment import lag_behind, resample
 
 
 @pytest.mark.parametrize("rate_hz", [20.0, 200.0, 1000.0])

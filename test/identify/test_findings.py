@@ -12,14 +12,14 @@ from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import measure_timing
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.fit import Excitation
-from nics_drl_bridge.identify.mounting import Mounting
-from nics_drl_bridge.identify.verdict import (
+from nics_drl_bridge.identify.findings import (
     describe_clocks,
     describe_mounting,
     describe_unlearnt,
     refuse_unexcited,
 )
+from nics_drl_bridge.identify.fit import Excitation
+from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.robot.spec import build_robot
 
 
