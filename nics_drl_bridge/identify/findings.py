@@ -37,7 +37,7 @@ from nics_drl_bridge.identify.statistics import CERTAIN, measure_rate_errors
 from nics_drl_bridge.identify.terms import Kind
 from nics_drl_bridge.identify.textbook import Yardstick
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream
-from nics_drl_bridge.robot.curve import delays
+from nics_drl_bridge.robot.curve import InputCurve, delays
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import HorizonErrors, Quality, TaylorModel
@@ -96,6 +96,8 @@ class Findings:
     # half-width [s] of the parabolas by which `derive_motion` derived the state; None if the
     # state is not derived from the poses
     motion_width_s: float | None = None
+    # input curves beyond doubt, from `find_input_curves`
+    clear_curves: tuple[InputCurve, ...] = ()
     # of the training part on one time axis, from `fit_terms`
     samples: Samples | None = None
     # all terms (Eq. 1), from `fit_terms`

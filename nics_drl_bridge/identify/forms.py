@@ -45,8 +45,8 @@ LAGS_S = (0.05, 0.15, 0.4, 1.0, 2.0)
 DEAD = np.linspace(0.0, 0.45, 10)
 FULL = np.linspace(0.15, 1.0, 18)
 WORTH = 0.03  # minimum fraction of the residual variance that a curve must explain
-# more for the turn rate, where understeer looks alike
-WORTH_OF_TURN = 0.25
+# fraction from which it is beyond doubt; higher for the turn rate, where understeer looks alike
+CLEAR = 0.25
 STRIDE_S = 0.04
 NOTHING = 1e-6  # [m/s, rad/s]
 ENOUGH_ROWS = 1000  # to rank delays
@@ -57,8 +57,13 @@ LONGEST_S = 0.4  # a delay is sought this far around where its search starts
 # step of their refinement
 DELAY_SCALE_S = 0.05
 CURVE_SCALE = 0.1
+# step of a reverse gain
+BACK_SCALE = 0.2
+BACK_RANGE = (0.2, 5.0)
 # fraction of a command's maximum at which the search for a dead zone starts
 SMALL_DEAD = 0.05
+# minimum fraction of the rows in which a command drives backwards, to determine its reverse gain
+TWO_WAY = 0.05
 # fraction of a command's maximum by which it must exceed the end of its curve
 NEAR_END = 0.01
 SELDOM = 1.0  # percentage of a drive that must exceed a rate limit for it to count
@@ -101,7 +106,7 @@ def find_input_curve(
     if not found:
         return None
     best = max(found, key=lambda candidate: candidate.gain)
-    needed = WORTH if best.drives else WORTH_OF_TURN
+    needed = WORTH if best.drives else CLEAR
     return best if best.gain >= needed else None
 
 
@@ -180,9 +185,10 @@ class Form:
     """Effects in a model besides gains and lags."""
 
     curves: tuple[InputCurve, ...] = ()
-    # states with dry friction, a quadratic drag and a back-EMF
-    resisted: tuple[str, ...] = ()
+    friction: tuple[str, ...] = ()  # states with dry friction
     limits: tuple[str, ...] = ()  # states with a maximum fall and rise
+    back: tuple[str, ...] = ()  # commands whose curve has a separate reverse gain
+    drag: tuple[str, ...] = ()  # states with a quadratic drag and a back-EMF
     # True if a car turns less at speed than its textbook, and slips sideways
     tyres: bool = False
     # initial delays of all commands [s]; empty if they share one
@@ -210,6 +216,7 @@ class Form:
                 dead=at.get(f"{name}.dead", curve.dead),
                 least=at.get(f"{name}.least", curve.least),
                 most=at.get(f"{name}.most", curve.most),
+                back=at.get(f"{name}.back", curve.back),
                 delay=at.get(f"{name}.delay", latency) - latency,
             )
             for name, curve in curves.items()
@@ -472,8 +479,10 @@ def _list_motor_values(evidence: Evidence, form: Form) -> dict[str, Row]:
             size = abs(response.gain) * float(np.ptp(variables[response.command]))
             rates[response.state] = np.array([-size, size])
     rows: dict[str, Row] = {}
-    for name in form.resisted:
-        rows |= _list_resistance_values(name, rates[name], variables, spec)
+    for name in form.friction:
+        rows[f"{name}.friction"] = _start_small(_find_strong(np.abs(rates[name])))
+    for name in form.drag:
+        rows |= _list_drag_values(name, rates[name], variables, spec)
     for name in form.limits:
         rows[f"{name}.fall"] = _start_at_strong(-rates[name])
         rows[f"{name}.rise"] = _start_at_strong(rates[name])
@@ -503,17 +512,14 @@ def _find_strong(rates: Array) -> float:
     return float(np.percentile(rates, STRONG))
 
 
-def _list_resistance_values(
+def _list_drag_values(
     name: str, rate: Array, variables: dict[str, Array], spec: RobotSpec
 ) -> dict[str, Row]:
-    """Returns the rows of a state's friction and drag, and of its back-EMF by each command."""
+    """Returns the rows of a state's drag, and of its back-EMF by each command that drives."""
     value = variables[name]
     strong = _find_strong(np.abs(rate))
     square = max(float(np.mean(value**2)), 1e-3)
-    rows = {
-        f"{name}.friction": _start_small(strong),
-        f"{name}.drag": _start_small(strong / square),
-    }
+    rows = {f"{name}.drag": _start_small(strong / square)}
     for command in list_driving_commands(spec):
         effect = max(float(np.abs(variables[command] * value).mean()), 1e-3)
         rows[f"{name}.back_emf.{command}"] = _start_small(strong / effect)
@@ -561,6 +567,8 @@ def _list_command_values(evidence: Evidence, form: Form) -> dict[str, Row]:
     rows |= {f"{name}.delay": (at, DELAY_SCALE_S, *bounds) for name, at in form.delays}
     for curve in form.curves:
         rows |= _list_curve_values(curve)
+        if curve.command in form.back:
+            rows[f"{curve.command}.back"] = (curve.back, BACK_SCALE, *BACK_RANGE)
     return rows
 
 
@@ -581,6 +589,19 @@ def _list_curve_values(curve: InputCurve) -> dict[str, Row]:
     }
 
 
+def find_two_way_curves(evidence: Evidence) -> tuple[InputCurve, ...]:
+    """Returns neutral curves of commands that drive the robot both ways."""
+    spec = evidence.drive.spec
+    curves = []
+    for name in list_driving_commands(spec):
+        sent = evidence.samples.x[:, spec.variable_names.index(name)]
+        if min((sent < 0.0).mean(), (sent > 0.0).mean()) > TWO_WAY:
+            least = float(sent.min())
+            most = float(sent.max())
+            curves.append(InputCurve(command=name, least=least, most=most))
+    return tuple(curves)
+
+
 def list_driving_commands(spec: RobotSpec) -> tuple[str, ...]:
     """Names the commands that drive a robot ahead, according to its textbook."""
     structure = probe_structure(spec)
@@ -590,18 +611,30 @@ def list_driving_commands(spec: RobotSpec) -> tuple[str, ...]:
     return tuple(spec.command[k].name for k in np.flatnonzero(moves[0]))
 
 
-def add_dead_zone(form: Form, evidence: Evidence, command: str) -> Form:
-    """Returns a form in which a command has a dead zone."""
-    names = evidence.drive.spec.variable_names
-    sent = evidence.samples.x[:, names.index(command)]
-    low = min(float(sent.min()), 0.0)
-    high = max(float(sent.max()), 0.0)
-    curves = {curve.command: curve for curve in form.curves}
-    curve = curves.get(command, InputCurve(command=command, least=low, most=high))
-    if not curve.dead:
-        dead = SMALL_DEAD * max(-low, high)
-        curves[command] = curve.model_copy(update={"dead": dead})
-    return replace(form, curves=tuple(curves.values()))
+def add_dead_zones(
+    form: Form, evidence: Evidence, commands: tuple[str, ...] | None = None
+) -> Form:
+    """Returns a form in which commands, by default those that drive ahead, have a dead zone."""
+    spec = evidence.drive.spec
+    if commands is None:
+        commands = list_driving_commands(spec)
+    bent = {c.command: c for c in form.curves}
+    for name in commands:
+        sent = evidence.samples.x[:, spec.variable_names.index(name)]
+        low = min(float(sent.min()), 0.0)
+        high = max(float(sent.max()), 0.0)
+        curve = bent.get(name, InputCurve(command=name, least=low, most=high))
+        if not curve.dead:
+            bent[name] = curve.model_copy(update={"dead": SMALL_DEAD * max(-low, high)})
+    return replace(form, curves=tuple(bent.values()))
+
+
+def add_reverse_gains(form: Form, curves: tuple[InputCurve, ...]) -> Form:
+    """Returns a form in which the commands of curves have separate reverse gains."""
+    curved = {curve.command for curve in form.curves}
+    more = tuple(curve for curve in curves if curve.command not in curved)
+    back = tuple(curve.command for curve in curves)
+    return replace(form, curves=form.curves + more, back=back)
 
 
 def drop_unreached_ends(

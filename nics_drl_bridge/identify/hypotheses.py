@@ -19,6 +19,7 @@ from nics_drl_bridge.identify.open_loop import HORIZON_S
 from nics_drl_bridge.identify.statistics import CERTAIN
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -26,7 +27,7 @@ ORDERS = (1, 2, 3)  # orders that `auto` chooses from
 PULLS = (0.1, 0.01, 0.001)  # pulls that are tried for each order
 ORDERS_OF_FOLLOWERS = (2, 3, 4)
 ORDERS_OF_MEASURED = (1,)  # besides that of the base
-WORTH = 0.95  # a change, or a higher order, must reduce the error to this fraction
+WORTH = 0.95  # a higher order must reduce the error to this fraction
 FOLDS = 3
 # spacing of trials' windows
 SPACING_S = 0.5
@@ -48,9 +49,8 @@ UNSEEN = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
 # (order, 0 for the textbook's terms alone; pull towards these)
 Hypothesis = tuple[int, float]
 TEXTBOOK = 0, 0.0
-RESISTANCE = "drag, back-EMF and dry friction"
-# name of a change, and the change
-Change = tuple[str, Callable[[forms.Form], forms.Form]]
+# name of a change, the change, and the fraction to which it must cut the error
+Change = tuple[str, Callable[[forms.Form], forms.Form], float]
 
 
 @dataclass(frozen=True)
@@ -338,30 +338,48 @@ class Base:
         return self.draft.cross_validate((TEXTBOOK,))[0]
 
 
-def fit_base(evidence: forms.Evidence) -> Base:
+def fit_base(evidence: forms.Evidence, clear: tuple[InputCurve, ...]) -> Base:
     """Fits the textbook with and without each part of a form; keeps what improves predictions.
 
-    Input curves that the motion showed are always kept.
+    `clear` curves are always kept.
     """
-    inputs = evidence.calibration.inputs
-    best = fit_form(evidence, replace(forms.make_form(evidence), curves=inputs))
-    start = "textbook with input curves" if inputs else "textbook"
-    candidates = [Candidate(start, best.trial.error, kept=True)]
+    best = _choose_curves(evidence, clear)
+    candidates = list(best.candidates)
     # Each change builds on those that were kept before it, so their order matters.
     tried = [best.draft.form]  # since the last that was kept
-    for name, change in list_changes(evidence):
+    for name, change, worth in list_changes(evidence):
         form = change(best.draft.form)
         if form in tried:
             continue
         tried.append(form)
         changed = fit_form(evidence, form, best)
-        is_better = changed.trial.level < WORTH * best.trial.level
+        is_better = changed.trial.level < worth * best.trial.level
         is_better = is_better and _is_certain(changed.found, best.found)
         candidates.append(Candidate(name, changed.trial.error, kept=is_better))
         if is_better:
             best = changed
             tried = [form]
     return replace(best, candidates=tuple(candidates))
+
+
+def _choose_curves(evidence: forms.Evidence, clear: tuple[InputCurve, ...]) -> Base:
+    """Fits the plainest form with all input curves found, or with the `clear` ones if better."""
+    plain_form = forms.make_form(evidence)
+    inputs = evidence.calibration.inputs
+    curved = fit_form(evidence, replace(plain_form, curves=inputs))
+    if len(inputs) <= len(clear):
+        start = "textbook with input curves" if inputs else "textbook"
+        return replace(
+            curved, candidates=(Candidate(start, curved.trial.error, kept=True),)
+        )
+    plain = fit_form(evidence, replace(plain_form, curves=clear))
+    # an infinite level: too short to judge
+    is_better = plain.trial.level < curved.trial.level or np.isinf(plain.trial.level)
+    candidates = (
+        Candidate("textbook", plain.trial.error, kept=True),
+        Candidate("input curves", curved.trial.error, kept=not is_better),
+    )
+    return replace(plain if is_better else curved, candidates=candidates)
 
 
 def refit_base(evidence: forms.Evidence, former: Base) -> Base:
@@ -398,15 +416,31 @@ def list_changes(evidence: forms.Evidence) -> Iterator[Change]:
         yield from _list_follower_changes(evidence)
         return
     spec = evidence.drive.spec
+    # Drag and friction are hard to distinguish, so both are tried, then each without the other.
     speeds = tuple(v.name for v in spec.state if v.twist == "vx")
+    delays = _list_delay_changes(forms.list_delays(evidence))
+    # First, because a wrong delay hides other effects and is hidden by them.
+    yield from delays
     if terms.has_slipping_tyres(spec):
-        yield "tyres that slip", _change(tyres=True)
+        yield "tyres that slip", _change(tyres=True), WORTH
     if speeds:
-        # Drag and friction are hard to distinguish.
-        yield RESISTANCE, _change(resisted=speeds)
-    yield from _list_delay_changes(forms.list_delays(evidence))
+        drag = "drag and back-EMF"
+        friction = "dry friction"
+        yield f"{drag}, and {friction}", _change(drag=speeds, friction=speeds), WORTH
+        yield f"without {drag}", _change(drag=()), 1.0 / WORTH
+        yield f"without {friction}", _change(friction=()), 1.0 / WORTH
+    yield from delays
     if speeds:
-        yield "limits of acceleration", _change(limits=speeds)
+        bent = partial(forms.add_dead_zones, evidence=evidence)
+        yield "a dead zone", bent, WORTH
+        yield "limits of acceleration", _change(limits=speeds), WORTH
+        others = tuple(v.name for v in spec.state if v.twist and not spec.steers)
+        if others:
+            yield f"limits of {', '.join(others)}", _change(limits=others), WORTH
+        backwards = forms.find_two_way_curves(evidence)
+        if backwards:
+            reverse = partial(forms.add_reverse_gains, curves=backwards)
+            yield "a gain of its own backwards", reverse, WORTH
 
 
 def _change(**parts: Any) -> Callable[[forms.Form], forms.Form]:
@@ -418,7 +452,7 @@ def _list_delay_changes(delays: tuple[tuple[str, float], ...]) -> list[Change]:
     """Returns the change that delays each command by itself, if there are several."""
     if len(delays) < 2:
         return []
-    return [("a delay of each command", _change(delays=delays))]
+    return [("a delay of each command", _change(delays=delays), WORTH)]
 
 
 def _is_certain(changed: shooting.Predictive, before: shooting.Predictive) -> bool:
@@ -435,12 +469,14 @@ def _list_follower_changes(evidence: forms.Evidence) -> Iterator[Change]:
     """Yields changes to the form of states that follow commands."""
     followed = forms.list_followed(evidence.drive)
     latency = evidence.calibration.command_latency_s
+    delays = _list_delay_changes(tuple((c, latency) for _, c in followed))
+    yield from delays
     for state, _ in followed:
-        yield f"limits of {state}", partial(forms.add_limits, state=state)
-    yield from _list_delay_changes(tuple((c, latency) for _, c in followed))
+        yield f"limits of {state}", partial(forms.add_limits, state=state), WORTH
+    yield from delays
     for _, command in followed:
-        bent = partial(forms.add_dead_zone, evidence=evidence, command=command)
-        yield f"a dead zone of {command}", bent
+        bent = partial(forms.add_dead_zones, evidence=evidence, commands=(command,))
+        yield f"a dead zone of {command}", bent, WORTH
 
 
 def list_candidates(
@@ -576,7 +612,11 @@ def describe_forms(base: Base, trials: Sequence[Trial], order: Order) -> Iterato
     ]
     if form.delays:
         parts.append("a delay of each command")
-    effects = {RESISTANCE: form.resisted, "limits": form.limits}
+    effects = {
+        "drag and back-EMF": form.drag,
+        "dry friction": form.friction,
+        "limits": form.limits,
+    }
     for effect, names in effects.items():
         if names:
             parts.append(f"{effect} of {', '.join(names)}")

@@ -66,6 +66,7 @@ from nics_drl_bridge.identify.findings import (
 )
 from nics_drl_bridge.identify.fit import ORDER
 from nics_drl_bridge.identify.forms import (
+    CLEAR,
     Evidence,
     drop_unreached_ends,
     find_input_curve,
@@ -411,14 +412,18 @@ def find_input_curves(drive: Drive, findings: Findings) -> Findings:
     findings = _with_likely_latency(findings)
     samples = resample_drive(training, findings)
     curves = []
+    clear = []
     for place in range(len(drive.spec.command)):
         candidate = find_input_curve(samples, drive.spec, place)
-        if candidate is not None:
-            curves.append(candidate.curve)
+        if candidate is None:
+            continue
+        curves.append(candidate.curve)
+        if candidate.gain >= CLEAR:
+            clear.append(candidate.curve)
     if not curves:
         return findings
     calibration = replace(findings.calibration, inputs=tuple(curves))
-    findings = replace(findings, calibration=calibration)
+    findings = replace(findings, calibration=calibration, clear_curves=tuple(clear))
     return _with_likely_latency(findings)  # the curves may hide a part of it
 
 
@@ -751,7 +756,7 @@ def _fit_base(
 ) -> tuple[hypotheses.Base, tuple[hypotheses.Trial, ...]]:
     """Fits the base, and tries orders of terms beyond it; a refit reuses both choices."""
     if findings.base is None:
-        base = hypotheses.fit_base(evidence)
+        base = hypotheses.fit_base(evidence, findings.clear_curves)
     else:
         base = hypotheses.refit_base(evidence, findings.base)
     asked = hypotheses.list_hypotheses(order, evidence.library)

@@ -160,7 +160,7 @@ def list_units(spec: RobotSpec) -> dict[str, str]:
 def list_motor_effects(identified: Identified) -> Iterator[str]:
     """Yields a line per parameter of a motor or an input curve, with its uncertainty.
 
-    The names are `throttle.dead`, `.least`, `.most` and `.delay` for a command, `vx.fall`,
+    The names are `throttle.dead`, `.least`, `.most`, `.back` and `.delay` for a command, `vx.fall`,
     `.rise`, `.friction` and `.drag` for a state, and `vx.back_emf.throttle` for a pair.
     """
     sigma = identified.calibration.uncertainty
@@ -184,6 +184,7 @@ Effect = tuple[str, str, str, float, str, float]
 def _list_curve_effects(model: TaylorModel, units: Mapping[str, str]) -> list[Effect]:
     """Lists the parameters of the input curves."""
     effects: list[Effect] = []
+    back = "reverse gain, relative to forward"
     for curve in model.inputs:
         name = curve.command
         unit = units[name]
@@ -192,6 +193,7 @@ def _list_curve_effects(model: TaylorModel, units: Mapping[str, str]) -> list[Ef
             (name, "dead", dead, curve.dead, unit, 0.0),
             (name, "least", "saturates below", curve.least, unit, -np.inf),
             (name, "most", "saturates above", curve.most, unit, np.inf),
+            (name, "back", back, curve.back, "", 1.0),
             (name, "delay", "delay after the common latency", curve.delay, "s", 0.0),
         ]
     return effects

@@ -15,9 +15,11 @@ from nics_drl_bridge.identify.findings import Findings, resample_drive
 from nics_drl_bridge.identify.forms import (
     Evidence,
     Form,
-    add_dead_zone,
+    add_dead_zones,
+    add_reverse_gains,
     drop_unreached_ends,
     find_input_curve,
+    find_two_way_curves,
     list_parameters,
     make_prediction_problem,
 )
@@ -81,7 +83,7 @@ def test_a_command_that_does_not_drive_a_robot_has_no_curve_by_its_speed(
 
 
 def test_values_are_sought_by_name_from_what_the_motion_shows(evidence):
-    form = Form((CURVE,), resisted=("vx",), limits=("vx",))
+    form = Form((CURVE,), friction=("vx",), limits=("vx",), drag=("vx",))
     sought = list_parameters(evidence, form)
     assert sought.names == (
         "latency",
@@ -102,9 +104,7 @@ def test_values_are_sought_by_name_from_what_the_motion_shows(evidence):
 def test_a_form_that_grows_starts_where_the_smaller_one_ended(evidence):
     small = list_parameters(evidence, Form((CURVE,)))
     ended = replace(small, start=small.start + np.array([0.02, 0.01, 0.0, 0.03]))
-    larger = list_parameters(evidence, Form((CURVE,), resisted=("vx",))).start_from(
-        ended
-    )
+    larger = list_parameters(evidence, Form((CURVE,), drag=("vx",))).start_from(ended)
     assert larger.start[:4] == pytest.approx(ended.start)
     assert larger.start[4] > 0.0
 
@@ -127,12 +127,14 @@ def test_the_least_delay_of_the_commands_is_their_latency(evidence):
 
 
 def test_values_become_curves_friction_limits_and_drag(evidence):
-    form = Form((CURVE,), resisted=("vx",), limits=("vx",))
+    form = Form((CURVE,), ("vx",), ("vx",), ("throttle",), ("vx",))
     sought = list_parameters(evidence, form)
-    values = np.array([0.03, 0.12, -0.2, 0.4, 0.25, 0.15, 1.2, 3.0, 2.0])
+    values = np.array([0.03, 0.12, -0.2, 0.4, 0.8, 0.25, 0.15, 1.2, 3.0, 2.0])
     at = sought.name(values)
     (curve,) = form.make_curves(at)
-    assert curve == InputCurve(command="throttle", dead=0.12, least=-0.2, most=0.4)
+    assert curve == InputCurve(
+        command="throttle", dead=0.12, least=-0.2, most=0.4, back=0.8
+    )
     spec = evidence.drive.spec
     model = form.actuate(make_model(spec, {"vx": {"vx": 1.0}}), at)
     assert model.friction.tolist() == [0.25, 0.0, 0.0]
@@ -141,11 +143,26 @@ def test_values_become_curves_friction_limits_and_drag(evidence):
     assert model.limits[0].tolist() == [-3.0, 2.0]
 
 
-def test_a_command_is_given_one_dead_zone_by_its_name(evidence):
-    (curve,) = add_dead_zone(Form(), evidence, "throttle").curves
+def test_a_dead_zone_is_tried_of_the_command_that_drives_alone(evidence):
+    (curve,) = add_dead_zones(Form(), evidence).curves
     assert curve.command == "throttle"
     assert 0.0 < curve.dead < 0.05
-    assert add_dead_zone(Form((CURVE,)), evidence, "throttle").curves == (CURVE,)
+    assert add_dead_zones(Form((CURVE,)), evidence).curves == (CURVE,)
+    assert add_reverse_gains(add_dead_zones(Form(), evidence), (curve,)).back == (
+        "throttle",
+    )
+
+
+def test_only_a_command_that_drives_both_ways_may_have_a_gain_of_its_own_backwards(
+    evidence,
+):
+    (both,) = find_two_way_curves(evidence)
+    assert both.command == "throttle"
+    form = add_reverse_gains(Form(), (both,))
+    assert form.back == ("throttle",)
+    assert len(list_parameters(evidence, form).sought) == 4  # it has no dead zone
+    forwards = replace(evidence.samples, x=np.abs(evidence.samples.x))
+    assert find_two_way_curves(replace(evidence, samples=forwards)) == ()
 
 
 def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, samples):

@@ -50,7 +50,7 @@ def test_a_car_without_drag_and_friction_is_given_none():
     samples = resample_drive(found.training, found)
     library = make_library(found.whole, found)
     evidence = Evidence(found.training, found.calibration, samples, library)
-    base = fit_base(evidence)
+    base = fit_base(evidence, found.clear_curves)
     values = base.found.named
     assert values.get("throttle.dead", 0.0) < 0.01
     assert values.get("vx.friction", 0.0) < 0.05
@@ -72,7 +72,7 @@ def test_a_car_that_slips_shows_its_effects_is_predicted_and_its_lever_is_not_be
     form = found.findings.base.draft.form
     values = found.findings.base.found.named
     assert form.tyres
-    assert form.resisted == ("vx",)
+    assert form.drag == form.friction == ("vx",)
     assert values["throttle.dead"] == pytest.approx(0.1, abs=0.01)
     assert values["vx.friction"] == pytest.approx(0.3, abs=0.1)
     assert 0.0 < sigma["throttle.dead"] < 0.02
