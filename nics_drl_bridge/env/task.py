@@ -410,8 +410,8 @@ class Task(ABC):
         return shares, touched
 
     def sensor_shares(self, view: RobotView) -> Observation:
-        """Returns the fractions (..., Q) of `sensors`, in their order."""
-        shares = []
+        """Returns the fractions (..., Q) of `sensors`, in their order; Q may be 0."""
+        shares = [np.zeros((*view.pose.shape[:-1], 0), np.float32)]
         for sensor in self.sensors:
             readings = view.sensed[sensor.name]
             shares.append(sensor.shares(readings))

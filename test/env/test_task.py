@@ -26,6 +26,7 @@ from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import open_model
+from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -118,6 +119,13 @@ def test_a_file_without_a_task_that_can_be_made_is_told_of_in_one_sentence(
     assert str(file) in str(caught.value)
     assert told in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_robot_without_further_sensors_has_no_fractions_of_them():
+    task = make_task("navigation", direct_model())
+    pose = np.zeros((4, 2, 3))
+    view = RobotView(pose, pose, np.zeros((4, 2, 8), np.float32))
+    assert task.sensor_shares(view).shape == (4, 2, 0)
 
 
 def test_the_discrete_actions_are_the_papers_drives():
