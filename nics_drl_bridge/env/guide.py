@@ -35,7 +35,8 @@ class Guide:
         cells = np.maximum(CELL, np.sqrt(spans.prod(axis=1) / MOST_CELLS))
         counts = np.maximum(np.ceil(spans / cells[:, None]), 2.0)
         sizes = counts[:, ::-1].astype(np.int64)
-        walls = np.full((len(members), *sizes.max(axis=0)), np.inf, np.float32)
+        rows, columns = sizes.max(axis=0)
+        walls = np.full((len(members), rows, columns), np.inf, np.float32)
         stands = np.zeros((len(members), sampler.count), np.bool_)
         for p, scene_sampler in enumerate(sampler.samplers):
             kernels.sample_walls(
@@ -56,7 +57,8 @@ class Guide:
             _find_inner_radius(footprint),
             footprint.radius,
         )
-        self.fields = np.zeros((worlds, sampler.robots, *walls.shape[1:]), np.float32)
+        shape = (worlds, sampler.robots, *walls.shape[1:])
+        self.fields = np.zeros(shape, np.float32)
 
     def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
         """Compute the path lengths in the scenes of episodes that begin in some worlds (n,)."""

@@ -86,7 +86,8 @@ def find_ways(
             for j in range(width):
                 space[i, j] = np.float32(frame[2] * _find_cost(space[i, j], grid))
         for m in range(goals.shape[1]):
-            _spread(out[worlds[n], m, :height, :width], space, goals[n, m], frame)
+            field = out[worlds[n], m, :height, :width]
+            _spread(field, space, goals[n, m], frame)
 
 
 @kernel
