@@ -209,17 +209,17 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         if len(listed) != count:
             raise ConfigError(f"{len(listed)} seeds for {count} worlds; give one each.")
         # These worlds restart with a seed.
-        fresh = chosen & np.array([one is not None for one in listed])
+        seeded = chosen & np.array([one is not None for one in listed])
         seeds = np.array([one or 0 for one in listed], np.int64)
         # Seeds are drawn for worlds that never had one.
-        new = chosen & (self._episode < 0) & ~fresh
+        new = chosen & (self._episode < 0) & ~seeded
         if new.any():
             first = int(self.np_random.integers(2**31))
             seeds = np.where(new, first + np.arange(count), seeds)
-            fresh = fresh | new
+            seeded = seeded | new
         self.ready = False
-        self._first[fresh] = seeds[fresh]
-        self._episode[fresh] = -1
+        self._first[seeded] = seeds[seeded]
+        self._episode[seeded] = -1
         if not chosen.all():  # the other worlds keep their observation
             self._out[...] = self.task.observation(
                 self._make_view(slice(None)), self.memory
@@ -260,10 +260,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         self._starts[worlds] = self.simulator.data.pose[worlds]
         goals = self.simulator.goals[worlds]
         episodes = Episodes(seeds, self._starts[worlds], goals)
-        fresh = reset_options.begin_task(
+        memory = reset_options.begin_task(
             self.task, episodes, options, scenes, self.world, "start", "reset_mask"
         )
-        for name, rows in fresh.items():
+        for name, rows in memory.items():
             if name not in self.memory:
                 self.memory[name] = np.zeros(
                     (self.num_envs, *rows.shape[1:]), rows.dtype
@@ -271,7 +271,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
             self.memory[name][worlds] = rows
         self.ended[worlds] = False
         self._awaits_reset[worlds] = False
-        seen = self.task.observation(self._make_view(worlds), fresh)
+        seen = self.task.observation(self._make_view(worlds), memory)
         out[worlds] = self.task.check_result(
             "observation", seen, (len(worlds), *out.shape[1:])
         )
@@ -306,8 +306,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         outcome = join_outcomes(
             run(lambda part: self._advance(part, given[part], out, resetting))
         )
-        terminated = self.ended.all(axis=1) & ~resetting
-        truncated = (self.simulator.data.steps >= self._limit) & ~resetting
+        terminated = np.asarray(self.ended.all(axis=1))
+        truncated = self.simulator.data.steps >= self._limit
         reward = np.where(resetting, 0.0, total(self._reward))
         done = terminated | truncated
         infos: Info = {}
@@ -380,13 +380,13 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         success = success.reshape(self.num_envs, -1).all(axis=1)
         self._episode[self._teacher.find_repeats(done, success)] -= 1
 
-    def _add_infos(self, infos: Info, facts: Info, fresh: Flags) -> None:
-        infos |= add_masks(self._get_known(), np.ones_like(fresh))
-        any_fresh = bool(fresh.any())
-        if any_fresh:
-            infos |= add_masks(self._get_beginnings(), fresh, True)
-        if not fresh.all():
-            infos |= add_masks(facts, ~fresh, any_fresh)
+    def _add_infos(self, infos: Info, facts: Info, began: Flags) -> None:
+        infos |= add_masks(self._get_known(), np.ones_like(began))
+        any_began = bool(began.any())
+        if any_began:
+            infos |= add_masks(self._get_beginnings(), began, True)
+        if not began.all():
+            infos |= add_masks(facts, ~began, any_began)
 
     # Facts as arrays (N, ...) for worlds with one robot, or (N, M, ...) for teams.
 
@@ -480,10 +480,10 @@ def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> AnyArray:
     size = math.prod(shape) * dtype.itemsize
     if size < LARGE or not hasattr(mmap, "MAP_PRIVATE"):  # Windows
         return np.zeros(shape, dtype)
-    fresh = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
+    pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
     if hasattr(mmap, "MADV_NOHUGEPAGE"):
-        fresh.madvise(mmap.MADV_NOHUGEPAGE)
-    return np.frombuffer(fresh, dtype).reshape(shape)
+        pages.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(pages, dtype).reshape(shape)
 
 
 def add_masks(facts: Mapping[str, Any], mask: Flags, alone: bool = False) -> Info:

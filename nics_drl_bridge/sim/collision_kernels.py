@@ -418,9 +418,9 @@ def _place(way: float, cells_per_metre: float, side: float) -> int:
 
 
 @kernel(inline=True)
-def _cell(body: Array, stands: bool, frame: Array) -> int:
+def _cell(body: Array, is_sorted: bool, frame: Array) -> int:
     side = int(frame[SIDE])
-    if not stands or body[RADIUS] * frame[PER_METRE] > 1.0:
+    if not is_sorted or body[RADIUS] * frame[PER_METRE] > 1.0:
         return side * side
     frame[LARGEST] = max(frame[LARGEST], body[RADIUS])
     row = _place(body[Y] - frame[BOTTOM], frame[PER_METRE], side)
@@ -428,13 +428,13 @@ def _cell(body: Array, stands: bool, frame: Array) -> int:
 
 
 @kernel
-def sort_into_cells(n: int, bodies: Array, standing: int, cells: BodyCells) -> None:
-    """Sort the bodies (K, 7) of a world; the first `standing` go into cells."""
+def sort_into_cells(n: int, bodies: Array, count: int, cells: BodyCells) -> None:
+    """Sort the bodies (K, 7) of a world; the first `count` go into cells."""
     low_x = np.inf
     low_y = np.inf
     high_x = -np.inf
     high_y = -np.inf
-    for k in range(standing):
+    for k in range(count):
         if bodies[k, RADIUS] > 0.0:
             low_x = min(low_x, bodies[k, X])
             high_x = max(high_x, bodies[k, X])
@@ -455,7 +455,7 @@ def sort_into_cells(n: int, bodies: Array, standing: int, cells: BodyCells) -> N
     first[:] = 0
     for k in range(len(bodies)):
         if bodies[k, RADIUS] > 0.0:
-            cell_of[k] = _cell(bodies[k], k < standing, frame)
+            cell_of[k] = _cell(bodies[k], k < count, frame)
             first[cell_of[k] + 1] += 1
     for cell in range(len(first) - 1):
         first[cell + 1] += first[cell]
@@ -480,23 +480,23 @@ def _copy(body: Array, to: Array) -> None:
 def put_in_order(
     n: int,
     bodies: Array,
-    standing: int,
+    count: int,
     spare: Array,
     cells: BodyCells,
 ) -> None:
-    """Sort the first `standing` bodies (K, 7) in place, absent ones last.
+    """Sort the first `count` bodies (K, 7) in place, absent ones last.
 
     None of these may move. Neighbours then share cache lines, so that few accesses miss
     the cache. `spare` (K, 7) is scratch.
     """
-    sort_into_cells(n, bodies[:standing], standing, cells)
+    sort_into_cells(n, bodies[:count], count, cells)
     first = cells.first[n]
     count = first[-1]
-    for k in range(standing):
+    for k in range(count):
         _copy(bodies[k], spare[k])
     for i in range(count):
         _copy(spare[cells.then[0, i]], bodies[i])
-    for k in range(standing):
+    for k in range(count):
         if spare[k, RADIUS] <= 0.0:
             _copy(spare[k], bodies[count])
             count += 1

@@ -436,8 +436,10 @@ def _mark(m: int, k: int, world: ContactWorld) -> None:
 def _halt(m: int, begin: float, time: float, end: float, world: ContactWorld) -> bool:
     """Make a robot that overlaps something at the end of a step only turn, or stop.
 
+    If it stands already, an obstacle that runs into it stops.
+
     Returns:
-        True if it did either.
+        True if robot or obstacle did so.
     """
     motion = world.scratch.motions[m]
     gap, whom = find_contacts(m, 0.0, 0.0, world)

@@ -36,7 +36,6 @@ from nics_drl_bridge.sim import obstacle_kernels as obstacles
 from nics_drl_bridge.sim import sensing_kernels as sensing
 from nics_drl_bridge.sim.collision_kernels import (
     MOVED,
-    is_round,
     put_in_order,
     sort_into_cells,
 )
@@ -358,13 +357,8 @@ def _find_what_is_near(
         # Each component is uniform, hence at most sqrt(3) standard deviations.
         sum_of_deviations = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
         path = lane_poses[LANE_PATH, first_lane + m]
-        body = data.bodies[n, first + m]
-        if not is_round(body, scene.outlines):
-            # Turning sweeps the corners, which adds to the path.
-            turned = lane_poses[LANE_HEADING, first_lane + m] - data.pose[n, m, 2]
-            path += abs(turned) * body[RADIUS]
         path += math.sqrt(3.0 * period) * sum_of_deviations
-        reach[first + m] = body[RADIUS] + path
+        reach[first + m] = data.bodies[n, first + m, RADIUS] + path
         longest = max(longest, path)
     if scene.crowded:
         sort_into_cells(n, data.bodies[n], data.bodies.shape[1], cells)
