@@ -18,7 +18,7 @@ from nics_drl_bridge.random_kernels import episode_seed
 
 # Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation.
 LIMIT = 1000.0
-ONE = np.float32(1.0).view(np.int32)
+ONE_BITS = np.float32(1.0).view(np.int32)
 BLOCK = 64  # number of beams checked together
 # limit of a beam's contribution to a contact [m]
 FURTHEST = np.float32(0.04)
@@ -92,7 +92,7 @@ def look(shares: Singles, ranges: Singles, scale: ScanScale) -> bool:
         share = share if share > np.float32(0.0) else np.float32(0.0)
         # Compare as integers, which keeps the order: LLVM turns two float limits into masks.
         bits = np.float32(share).view(np.int32)
-        shares[p] = np.int32(min(bits, ONE)).view(np.float32)
+        shares[p] = np.int32(min(bits, ONE_BITS)).view(np.float32)
     return has_contact(ranges, scale)
 
 

@@ -378,6 +378,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         # A task that tells no success never fails.
         success = facts.get("is_success", done)
         success = success.reshape(self.num_envs, -1).all(axis=1)
+        # The next episode of these worlds then has the seed of this one.
         self._episode[self._teacher.find_repeats(done, success)] -= 1
 
     def _add_infos(self, infos: Info, facts: Info, began: Flags) -> None:
@@ -486,8 +487,13 @@ def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> AnyArray:
     return np.frombuffer(pages, dtype).reshape(shape)
 
 
-def add_masks(facts: Mapping[str, Any], mask: Flags, alone: bool = False) -> Info:
-    """Pairs facts (N, ...) with masks `_name` (N,), like Gymnasium; zero elsewhere if `alone`."""
+def add_masks(
+    facts: Mapping[str, Any], mask: Flags, blank_others: bool = False
+) -> Info:
+    """Pairs facts (N, ...) with masks `_name` (N,), like Gymnasium.
+
+    With `blank_others`, the facts of worlds outside the mask are zero.
+    """
     paired: Info = {}
     gone = ~mask
     most = 2 * np.count_nonzero(mask) > len(mask)
@@ -495,11 +501,11 @@ def add_masks(facts: Mapping[str, Any], mask: Flags, alone: bool = False) -> Inf
         paired[name] = values
         paired[f"_{name}"] = mask.copy()
         if isinstance(values, Mapping):
-            paired[name] = add_masks(values, mask, alone)
-        elif alone and most:
+            paired[name] = add_masks(values, mask, blank_others)
+        elif blank_others and most:
             paired[name] = values.copy()
             paired[name][gone] = np.zeros((), values.dtype)
-        elif alone:
+        elif blank_others:
             paired[name] = zeros(values.shape, values.dtype)
             paired[name][mask] = values[mask]
     return paired

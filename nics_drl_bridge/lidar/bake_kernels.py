@@ -7,7 +7,7 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers, Singles
-from nics_drl_bridge.lidar.beam_kernels import INF, Beams, make_beams
+from nics_drl_bridge.lidar.beam_kernels import INF_BITS, Beams, make_beams
 from nics_drl_bridge.lidar.exact_kernels import (
     place_corner,
     scan_circle,
@@ -90,7 +90,7 @@ def find_range(angle: float, shape: ShapeAhead) -> np.float32:
     direction[0, 0] = math.cos(angle)
     direction[1, 0] = math.sin(angle)
     scan = np.empty(1, np.int32)
-    scan[0] = INF
+    scan[0] = INF_BITS
     scan_ahead(scan, make_beams(direction, angle, 1.0), shape)
     nearest = scan.view(np.float32)[0]
     if not np.isfinite(nearest):  # a wall seen edge-on

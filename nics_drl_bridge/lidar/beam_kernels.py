@@ -32,7 +32,7 @@ ATAN = (
     -0.0071661648959,
     0.0010844927512,
 )
-INF = np.array([np.inf], np.float32).view(np.int32)[0]
+INF_BITS = np.array([np.inf], np.float32).view(np.int32)[0]
 
 
 class Beams(NamedTuple):

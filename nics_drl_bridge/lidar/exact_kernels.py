@@ -40,7 +40,7 @@ class OutlineArrays(NamedTuple):
 def scan_circle(
     scan: ShortIntegers, beams: Beams, x: float, y: float, radius: float
 ) -> None:
-    """Fuse the exact ranges to a circle at (x, y): the near side, or from inside the far one."""
+    """Lower the beams that hit a circle at (x, y) to its near side, or from inside the far one."""
     distance = math.sqrt(x * x + y * y)
     is_inside = distance <= radius
     half = math.pi if is_inside else math.asin(radius / distance)
@@ -63,7 +63,7 @@ def scan_edge(
     start: tuple[float, float, float],
     end: tuple[float, float, float],
 ) -> None:
-    """Fuse the exact ranges to a straight wall; its ends are x, y [m] and the bearing [rad]."""
+    """Lower the beams that hit a straight wall; its ends are x, y [m] and the bearing [rad]."""
     ex = end[0] - start[0]
     ey = end[1] - start[1]
     cross = start[0] * ey - start[1] * ex
@@ -106,7 +106,7 @@ def scan_polygon(
     s: float,
     corners: Array,
 ) -> None:
-    """Fuse the exact ranges to the outline `corners` (V, 2), rotated by (c, s), at (x, y)."""
+    """Lower the beams that hit the outline `corners` (V, 2), rotated by (c, s), at (x, y)."""
     corner_x, corner_y = place_corner(x, y, c, s, corners[-1])
     start = corner_x, corner_y, arctan2(corner_y, corner_x)
     for v in range(len(corners)):

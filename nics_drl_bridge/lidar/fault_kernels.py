@@ -28,7 +28,7 @@ ROUNDING = 1e-9  # rounding error of a multiple of the quantisation step [m]
 # Ranges are raised as integers, which have the same order, by the maximum of two
 # numbers: if a range might stay unchanged, LLVM would mask the store, which is slower
 # than everything else here.
-INF, MINUS_INF, NONE = np.array([np.inf, -np.inf, -2.0], np.float32).view(np.int32)
+INF_BITS, MINUS_INF, NONE = np.array([np.inf, -np.inf, -2.0], np.float32).view(np.int32)
 
 
 class Distortion(NamedTuple):
@@ -98,7 +98,7 @@ def _drop_returns(ranges: Singles, range_max: float, faults: Array, by: int) -> 
     for i in range(len(ranges)):
         reach = ranges[i] if ranges[i] > np.float32(0.0) else np.float32(0.0)
         lost = random.share_of(random.bits(by, i)) < share + far * reach * reach
-        whole[i] = max(whole[i], INF if lost else NONE)
+        whole[i] = max(whole[i], INF_BITS if lost else NONE)
 
 
 @kernel(inline=True)
@@ -170,7 +170,9 @@ def _report(value: np.float32, measured: np.float32, device: Distortion) -> np.f
     """Return the measured range, or the value reported for too close or no return."""
     replacement = device.close if value < device.close else value
     return (
-        measured if np.float32(value).view(np.uint32) < np.uint32(INF) else replacement
+        measured
+        if np.float32(value).view(np.uint32) < np.uint32(INF_BITS)
+        else replacement
     )
 
 

@@ -124,9 +124,9 @@ def look_up_body(
     bearing = arctan2(dy, dx)
     shape = table.shapes[np.uintp(np.int32(body[SHAPE]))]
     # i and j number the grid distances and the grid rotations, see the formula above.
-    exact_i = (distance - body[RADIUS]) * shape.distances_per_metre
+    fractional_i = (distance - body[RADIUS]) * shape.distances_per_metre
     last_i = np.int32(table.distances - 2)
-    i = np.int32(max(min(np.int32(exact_i), last_i), np.int32(0)))
+    i = np.int32(max(min(np.int32(fractional_i), last_i), np.int32(0)))
     turns = (body[HEADING] - bearing) * (1.0 / TWO_PI)
     turns -= np.floor(turns)
     j = np.int32(turns * shape.rotations + 0.5)
@@ -149,22 +149,22 @@ def look_up_body(
     right = find_silhouette(view, near[RIGHT_CORNERS], hull, hulls, shape, RIGHT)
     left = find_silhouette(view, near[LEFT_CORNERS], hull, hulls, shape, LEFT)
     span = span_beams(bearing - lidar.heading + right, left - right, beams)
-    centre = span.right - right / beams.step
+    bearing_beam = span.right - right / beams.step
     # c_p and c_(p+1) of the first beam, in both rows
     beam_count = beams.directions.shape[1]
     turned_by = 0.0
     for _ in range(2):
         first, end = beams_within(span, turned_by, beam_count)
         hits = np.int32(end - first)
-        exact_point = (first + turned_by - centre) * (1 << table.shift)
-        point = np.floor(exact_point)
+        fractional_point = (first + turned_by - bearing_beam) * (1 << table.shift)
+        point = np.floor(fractional_point)
         part = found[np.uintp(count)]
         part.first = first
         part.hits = hits
         part.near, part.near_next = find_points(near, np.int64(point), hits, table)
         part.far, part.far_next = find_points(far, np.int64(point), hits, table)
-        part.next_weight = np.float32(exact_point - point)
-        part.far_weight = np.float32(exact_i - i)
+        part.next_weight = np.float32(fractional_point - point)
+        part.far_weight = np.float32(fractional_i - i)
         count += int(hits > 0)
         turned_by = span.full_turn
         if span.left < turned_by:

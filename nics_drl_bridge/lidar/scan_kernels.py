@@ -8,7 +8,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers, Singles
 from nics_drl_bridge.lidar.beam_kernels import (
-    INF,
+    INF_BITS,
     Beams,
     LidarPose,
     locate_lidar,
@@ -140,7 +140,7 @@ def scan_robot(
     """
     scan = scratch.scan
     for i in range(len(scan)):
-        scan[i] = INF
+        scan[i] = INF_BITS
     count = 0
     rows = lidar.table.rows
     for k in nearby:

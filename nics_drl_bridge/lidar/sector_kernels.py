@@ -12,7 +12,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Array, ShortIntegers, Singles
 
 TURN = 2.0 * math.pi
-INF, UNKNOWN = np.array([np.inf, np.nan], np.float32).view(np.int32)
+INF_BITS, UNKNOWN = np.array([np.inf, np.nan], np.float32).view(np.int32)
 
 
 class SectorPlan(NamedTuple):
@@ -46,7 +46,7 @@ def resample(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
     nearest = out.view(np.int32)
     known = np.empty(2 * beams, np.int32)  # twice, because a sector may span the seam
     for b in range(beams):
-        is_known = np.int32(whole[b] & np.int32(0x7FFFFFFF)) <= INF
+        is_known = np.int32(whole[b] & np.int32(0x7FFFFFFF)) <= INF_BITS
         known[b] = whole[b] if is_known else UNKNOWN
         known[beams + b] = known[b]
     for s in range(len(out)):

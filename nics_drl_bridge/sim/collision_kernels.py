@@ -456,18 +456,14 @@ def sort_into_cells(n: int, bodies: Array, count: int, cells: BodyCells) -> None
     for k in range(len(bodies)):
         if bodies[k, RADIUS] > 0.0:
             cell_of[k] = _cell(bodies[k], k < count, frame)
-            first[cell_of[k] + 1] += 1
-    for cell in range(len(first) - 1):
-        first[cell + 1] += first[cell]
-    end = first[-1]
+            first[cell_of[k]] += 1
+    for cell in range(1, len(first)):
+        first[cell] += first[cell - 1]
+    # Each entry is now the end of its cell; filled from the end, it becomes the beginning.
     for k in range(len(bodies) - 1, -1, -1):
         if bodies[k, RADIUS] > 0.0:
-            first[cell_of[k] + 1] -= 1
-            then[first[cell_of[k] + 1]] = k
-    # Shift: each entry is the count of the cell before it.
-    for cell in range(len(first) - 1):
-        first[cell] = first[cell + 1]
-    first[-1] = end
+            first[cell_of[k]] -= 1
+            then[first[cell_of[k]]] = k
 
 
 @kernel(inline=True)
@@ -480,23 +476,23 @@ def _copy(body: Array, to: Array) -> None:
 def put_in_order(
     n: int,
     bodies: Array,
-    count: int,
+    obstacles: int,
     spare: Array,
     cells: BodyCells,
 ) -> None:
-    """Sort the first `count` bodies (K, 7) in place, absent ones last.
+    """Sort the obstacles, the first of the bodies (K, 7), in place, absent ones last.
 
     None of these may move. Neighbours then share cache lines, so that few accesses miss
     the cache. `spare` (K, 7) is scratch.
     """
-    sort_into_cells(n, bodies[:count], count, cells)
+    sort_into_cells(n, bodies[:obstacles], obstacles, cells)
     first = cells.first[n]
     count = first[-1]
-    for k in range(count):
+    for k in range(obstacles):
         _copy(bodies[k], spare[k])
     for i in range(count):
         _copy(spare[cells.then[0, i]], bodies[i])
-    for k in range(count):
+    for k in range(obstacles):
         if spare[k, RADIUS] <= 0.0:
             _copy(spare[k], bodies[count])
             count += 1

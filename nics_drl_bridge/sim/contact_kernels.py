@@ -375,7 +375,7 @@ def _stop_obstacles(m: int, time: float, world: ContactWorld) -> None:
         if 0 <= touch.other < world.first and approach > 0.0:
             world.scratch.stops[touch.other] = time
             _mark(m, touch.other, world)
-        touch.recedes = min(approach, 0.0)
+        touch.other_speed = min(approach, 0.0)
 
 
 @kernel
@@ -383,7 +383,8 @@ def _deflect(m: int, time: float, world: ContactWorld) -> None:
     """Deflect the motion of a robot so that it does not approach what it touches.
 
     Each pass removes the approach at one touch after another, by the impulse that would
-    stop a ring there: the robot slides without friction, and a touched corner turns it.
+    stop a ring of the robot's radius there: the robot slides without friction, and a touched
+    corner turns it.
     """
     motion = world.scratch.motions[m]
     body = world.bodies[world.first + m]
@@ -399,12 +400,16 @@ def _deflect(m: int, time: float, world: ContactWorld) -> None:
         is_done = True
         for touch in listed.touches[: listed.number[0]]:
             arm = (touch.x - body[X]) * touch.ny - (touch.y - body[Y]) * touch.nx
-            away = touch.nx * vx + touch.ny * vy + arm * turn - touch.recedes
-            if sweep == 0 and away < -APPROACH * motion.bound:
+            separation_speed = (
+                touch.nx * vx + touch.ny * vy + arm * turn - touch.other_speed
+            )
+            if sweep == 0 and separation_speed < -APPROACH * motion.bound:
                 _mark(m, touch.other, world)
-            lacks = SPRING * motion.bound * (1.0 - touch.gap / FLOOR) - away
-            if lacks > APPROACH * motion.bound:
-                push = lacks / (1.0 + arm * arm / inertia)
+            missing_speed = (
+                SPRING * motion.bound * (1.0 - touch.gap / FLOOR) - separation_speed
+            )
+            if missing_speed > APPROACH * motion.bound:
+                push = missing_speed / (1.0 + arm * arm / inertia)
                 vx += push * touch.nx
                 vy += push * touch.ny
                 turn += push * arm / inertia

@@ -241,7 +241,7 @@ class Touch:
     nx: float  # unit vector from the touched object to it
     ny: float
     gap: float  # [m]
-    recedes: (
+    other_speed: (
         float  # velocity of the touched object along the unit vector, 0 or less [m/s]
     )
     other: int  # body that it touches; -1 for a wall or the map

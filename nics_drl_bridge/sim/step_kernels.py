@@ -314,7 +314,7 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
         pose[2] = robot.wrap(lanes.pose[LANE_HEADING, lane])
         for i in range(data.state.shape[2]):
             data.state[n, m, i] = lanes.x[i, lane]
-        ahead, left, turn = draw_drift(n, m, data, motion)
+        ahead, left, turn = apply_drift(n, m, data, motion)
         if ahead != 0.0 or left != 0.0 or turn != 0.0:
             c = math.cos(pose[2])
             s = math.sin(pose[2])
@@ -417,7 +417,7 @@ def _move_carefully(
     drifts = False
     for m in range(len(may_touch)):
         if may_touch[m] != FREE:
-            ahead, left, turn = draw_drift(n, m, data, motion)
+            ahead, left, turn = apply_drift(n, m, data, motion)
             contacts.start_motion(m, ahead, left, turn, world)
             drifts = drifts or ahead != 0.0 or left != 0.0 or turn != 0.0
     if drifts:  # the drift is applied as a twist over one second; the obstacles stay
@@ -428,6 +428,7 @@ def _move_carefully(
             data.pose[n, m, 0] = body[X]
             data.pose[n, m, 1] = body[Y]
             data.pose[n, m, 2] = robot.wrap(body[HEADING])
+    # An obstacle that stopped gets its mean velocity over the period.
     for k in range(world.first if obstacles_move else 0):
         if stops[k] < period:
             for i in range(3):
@@ -460,10 +461,10 @@ def compute_rates(
 
 
 @kernel(inline=True)
-def draw_drift(
+def apply_drift(
     n: int, m: int, data: State, motion: Dynamics
 ) -> tuple[float, float, float]:
-    """Draw the drift of robot m: forward, left [m], heading [rad]; disturb its state.
+    """Disturb the state of robot m; return its drift forward, left [m] and in heading [rad].
 
     The drift grows with the square root of time. Draws are uniform, within sqrt(3)
     standard deviations, which is cheap; the sum over several periods is close to

@@ -87,12 +87,12 @@ def backward(net: Net, observations: Singles, gradient: Singles) -> None:
         net.gradients[middle : middle + outs] = gradient.sum(axis=0)
         if k > 0:
             side = 1 - side
-            ahead = net.output_gradients[side, : n * ins].reshape(n, ins)
-            np.dot(gradient, net.weights[at:middle].reshape(outs, ins), ahead)
+            earlier = net.output_gradients[side, : n * ins].reshape(n, ins)
+            np.dot(gradient, net.weights[at:middle].reshape(outs, ins), earlier)
             for i in range(n):
                 for j in range(ins):
-                    ahead[i, j] = ahead[i, j] if rows[i, j] > ZERO else ZERO
-            gradient = ahead
+                    earlier[i, j] = earlier[i, j] if rows[i, j] > ZERO else ZERO
+            gradient = earlier
 
 
 @kernel(allocates=True)

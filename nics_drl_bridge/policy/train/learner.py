@@ -99,7 +99,7 @@ class Learner:
         )
 
     def learn(self, transitions: Transitions, rate: float) -> float:
-        """Steps the weights along the gradients of batches; returns the last batch's loss."""
+        """Takes a gradient step on each batch; returns the loss of the last one."""
         count = len(transitions.observations)
         for _ in range(self.ppo.epochs):
             order = self.rng.permutation(count)

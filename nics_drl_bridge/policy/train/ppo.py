@@ -146,7 +146,7 @@ class LeanPpo:
         watch.begin(self.steps)
         if self._rollout is None:
             self.collector.last_observations = self.collector.worlds.reset()
-            self._take(watch, *self.collector.collect())
+            self._store_rollout(watch, *self.collector.collect())
         while self._rollout is not None:
             watch.keep(self.steps)
             if watch.ends(self.steps, self.act, log):
@@ -176,7 +176,7 @@ class LeanPpo:
         loss, *collected = run_parts(lambda job: job(), jobs)
         self._rollout = None
         for part in collected:
-            self._take(watch, *part)
+            self._store_rollout(watch, *part)
         return float(loss)
 
     def _collect(self) -> tuple[Rollout, Ended]:
@@ -185,7 +185,7 @@ class LeanPpo:
         finally:
             self.learner.core_is_free.set()
 
-    def _take(self, watch: Watch, rollout: Rollout, ended: Ended) -> None:
+    def _store_rollout(self, watch: Watch, rollout: Rollout, ended: Ended) -> None:
         self._rollout = rollout
         self._successes.extend(success for success, _ in ended)
         watch.collisions.extend(collision for _, collision in ended)
